@@ -1,0 +1,1 @@
+"""Point clouds: messages to points, filters, neighbours, local shape."""

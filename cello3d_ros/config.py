@@ -1,0 +1,288 @@
+"""Settings: frozen dataclasses, one section a room, validated when built, YAML in and out.
+
+The same YAML file serves the tools and, as a ROS parameter file, the node: the sections may stand
+at the top level or below ``/**: ros__parameters:``.  Every setting is a bool, int, float, str or a
+tuple of one of them, so that each is also a ROS parameter (``section.name``).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from cello3d_ros.errors import ConfigError
+
+
+def _setting(
+    default: Any,
+    doc: str,
+    low: float = -math.inf,
+    high: float = math.inf,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    return field(
+        default=default, metadata={"doc": doc, "low": low, "high": high, "choices": choices}
+    )
+
+
+class Section:
+    """Base of every section: checks type and range of each field when built."""
+
+    def __post_init__(self) -> None:
+        for setting in dataclasses.fields(self):  # type: ignore[arg-type]
+            value = _checked(setting, getattr(self, setting.name), type(self).__name__)
+            object.__setattr__(self, setting.name, value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloudConfig(Section):
+    """Filters of a scan and the neighbourhood of its normals and features."""
+
+    min_range_m: float = _setting(0.5, "points nearer to the sensor are dropped", 0.0)
+    max_range_m: float = _setting(100.0, "points farther from the sensor are dropped", 0.0)
+    voxel_m: float = _setting(0.2, "side of the cubes in which density is bounded", 1e-3)
+    max_points_per_voxel: int = _setting(4, "points kept in one cube, drawn at random", 1)
+    n_neighbors: int = _setting(20, "neighbours of a normal and its features", 3, 64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IcpConfig(Section):
+    """ICP pipeline (Table I of the paper)."""
+
+    error_metric: str = _setting(
+        "point_to_plane", "what ICP minimises", choices=("point_to_plane", "point_to_point")
+    )
+    n_neighbors: int = _setting(3, "associations of each reading point", 1, 16)
+    trim_ratio: float = _setting(0.7, "share of the associations kept, the closest", 0.01, 1.0)
+    max_iterations: int = _setting(80, "iterations before ICP gives up", 1, 10000)
+    rotation_epsilon_rad: float = _setting(1e-3, "mean rotation step that ends ICP", 0.0)
+    translation_epsilon_m: float = _setting(1e-3, "mean translation step that ends ICP", 0.0)
+    n_smoothed: int = _setting(3, "steps over which those means are taken", 1, 100)
+    n_reading_points: int = _setting(2000, "random subsample of the reading", 10)
+    n_reference_points: int = _setting(10000, "random subsample of the reference", 10)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OverlapConfig(Section):
+    """Points of the two registered clouds that have a neighbour in the other."""
+
+    radius_m: float = _setting(0.316, "largest distance of overlapping points", 1e-3)
+    min_points: int = _setting(100, "fewest overlapping points of an answer", 1)
+    min_ratio: float = _setting(0.1, "smallest share of overlapping reading points", 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridConfig(Section):
+    """Voxel grid over the overlap, centred on the reading frame (Sec. V-A)."""
+
+    n_cells: tuple[int, ...] = _setting((4, 4, 4), "cells along x, y, z", 1, 32)
+    extent_m: tuple[float, ...] = _setting((25.0, 25.0, 10.0), "size along x, y, z", 1e-3)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("n_cells", "extent_m"):
+            if len(getattr(self, name)) != 3:
+                raise ConfigError(f"GridConfig.{name} needs three numbers: {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplingConfig(Section):
+    """Brute-force sampling of ICP on one pair (Sec. IV-D, V-A)."""
+
+    n_samples: int = _setting(5000, "registrations of each pair", 2)
+    variance: float = _setting(0.05, "a of the starts T_mean exp(xi), xi ~ N(0, a I)", 0.0, 10.0)
+    max_gap: int = _setting(4, "largest j - i of a pair", 1)
+    seed: int = _setting(0, "seed of every random draw", 0)
+    max_offset_m: float = _setting(1.0, "a mean farther from the truth rejects the pair", 0.0)
+    max_offset_rad: float = _setting(1.0, "a mean farther from the truth rejects the pair", 0.0)
+    cluster_scale_m: float = _setting(0.1, "translation that counts as one radius of DBSCAN", 1e-6)
+    cluster_scale_rad: float = _setting(0.05, "rotation that counts as one radius", 1e-6)
+    n_rotations: int = _setting(4, "turns about z of each example, 1 is none", 1, 64)
+    cluster_min_share: float = _setting(
+        0.01, "share of the samples within one radius that makes a core point", 0.0, 1.0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingConfig(Section):
+    """Learning of Theta (Sec. IV-B)."""
+
+    shape: str = _setting(
+        "sandwich",
+        "what covariances are relative to; none is the paper",
+        choices=("none", "hessian", "sandwich"),
+    )
+    theta: str = _setting(
+        "low_rank", "form of Theta", choices=("upper_triangular", "diagonal", "low_rank")
+    )
+    rank: int = _setting(16, "rows of a low-rank Theta", 1, 10000)
+    loss: str = _setting("log_det", "paper is the printed det F", choices=("log_det", "paper"))
+    regularization: float = _setting(0.01, "lambda of lambda |Theta|^2", 0.0)
+    mean_weight: float = _setting(0.05, "share of the training mean in a prediction", 0.0, 1.0)
+    max_iterations: int = _setting(100, "optimiser steps", 1)
+    seed: int = _setting(0, "seed of the initial Theta", 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeConfig(Section):
+    """What only the node needs."""
+
+    model: str = _setting("", "model file; empty is the shipped one")
+    T_base_sensor: tuple[float, ...] = _setting(
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+        "sensor in the odometry's child frame: x y z qx qy qz qw",
+    )
+    odometry_timeout_s: float = _setting(0.5, "wait for odometry after a cloud's stamp", 0.0, 60.0)
+    odometry_gap_s: float = _setting(1.0, "odometry farther apart is not interpolated", 0.0)
+    odometry_buffer_s: float = _setting(10.0, "odometry remembered", 0.1, 3600.0)
+    max_pair_gap_s: float = _setting(5.0, "scans farther apart are not paired", 0.0)
+    max_failures: int = _setting(3, "failed pairs before the reference is given up", 1)
+    future_tolerance_s: float = _setting(0.5, "a cloud stamped later than now + this", 0.0)
+    floor_sigma_m: float = _setting(1e-4, "smallest published standard deviation", 1e-9)
+    floor_sigma_rad: float = _setting(1e-5, "smallest published standard deviation", 1e-9)
+    ceiling: float = _setting(900.0, "largest published eigenvalue (m^2, rad^2)", 1e-6, 1e3)
+    seed: int = _setting(0, "seed of the random subsamples", 0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        norm = math.hypot(*self.T_base_sensor[3:])
+        if len(self.T_base_sensor) != 7 or abs(norm - 1.0) > 1e-3:
+            raise ConfigError(
+                "NodeConfig.T_base_sensor needs x y z and a unit quaternion qx qy qz qw: "
+                f"{self.T_base_sensor}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pipeline:
+    """The settings from which a covariance follows: a model carries those it was trained with."""
+
+    cloud: CloudConfig = field(default_factory=CloudConfig)
+    icp: IcpConfig = field(default_factory=IcpConfig)
+    overlap: OverlapConfig = field(default_factory=OverlapConfig)
+    grid: GridConfig = field(default_factory=GridConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(Pipeline):
+    """All sections."""
+
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    node: NodeConfig = field(default_factory=NodeConfig)
+
+
+SECTIONS: dict[str, type[Any]] = {
+    "cloud": CloudConfig,
+    "icp": IcpConfig,
+    "overlap": OverlapConfig,
+    "grid": GridConfig,
+    "sampling": SamplingConfig,
+    "training": TrainingConfig,
+    "node": NodeConfig,
+}
+
+PIPELINE = ("cloud", "icp", "overlap", "grid")
+
+S = TypeVar("S", bound=Section)
+
+
+def section_from(kind: type[S], values: dict[str, Any], where: str) -> S:
+    """Build one section from a mapping.  Raises ConfigError naming what is wrong in ``where``."""
+    known = {setting.name for setting in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    if unknown := sorted(set(values) - known):
+        raise ConfigError(
+            f"{where}: unknown setting {unknown[0]!r}; known are {', '.join(sorted(known))}"
+        )
+    try:
+        return kind(**values)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
+def config_from(tree: dict[str, Any], where: str = "configuration") -> Config:
+    """Build a Config from nested mappings; what is not named keeps its default."""
+    if unknown := sorted(set(tree) - set(SECTIONS)):
+        raise ConfigError(
+            f"{where}: unknown section {unknown[0]!r}; known are {', '.join(SECTIONS)}"
+        )
+    sections = {}
+    for name, values in tree.items():
+        if not isinstance(values, dict):
+            raise ConfigError(f"{where}: section {name!r} must hold settings, not {values!r}")
+        sections[name] = section_from(SECTIONS[name], values, f"{where}: {name}")
+    return Config(**sections)
+
+
+def config_to(config: Pipeline) -> dict[str, dict[str, Any]]:
+    """Return the nested mappings from which ``config_from`` builds an equal Config."""
+    return {
+        name: {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in dataclasses.asdict(getattr(config, name)).items()
+        }
+        for name in SECTIONS
+        if hasattr(config, name)
+    }
+
+
+def pipeline_of(config: Pipeline) -> Pipeline:
+    """Return only the sections from which a covariance follows."""
+    return Pipeline(**{name: getattr(config, name) for name in PIPELINE})
+
+
+def differences(ours: Pipeline, theirs: Pipeline) -> list[str]:
+    """Name each pipeline setting that differs: ``icp.trim_ratio is 0.8, not 0.7``."""
+    return [
+        f"{name}.{key} is {value}, not {getattr(getattr(theirs, name), key)}"
+        for name in PIPELINE
+        for key, value in dataclasses.asdict(getattr(ours, name)).items()
+        if value != getattr(getattr(theirs, name), key)
+    ]
+
+
+def load_config(path: Path | str) -> Config:
+    """Read a YAML file, plain or a ROS parameter file.  Raises ConfigError."""
+    try:
+        with open(path, encoding="utf-8") as stream:
+            tree = yaml.safe_load(stream) or {}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"cannot read the configuration {path}: {error}") from None
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: expected sections such as 'icp:', found {tree!r}")
+    for value in tree.values():
+        if isinstance(value, dict) and "ros__parameters" in value:
+            tree = value["ros__parameters"] or {}
+            break
+    return config_from(tree, str(path))
+
+
+def _checked(setting: dataclasses.Field[Any], value: Any, owner: str) -> Any:
+    """Return ``value`` in the type of the setting's default, or raise ConfigError."""
+    name = f"{owner}.{setting.name}"
+    default = setting.default
+    if isinstance(default, tuple):
+        if not isinstance(value, (tuple, list)):
+            raise ConfigError(f"{name} must be a list of {type(default[0]).__name__}: {value!r}")
+        return tuple(_checked_scalar(setting, item, default[0], name) for item in value)
+    return _checked_scalar(setting, value, default, name)
+
+
+def _checked_scalar(setting: dataclasses.Field[Any], value: Any, default: Any, name: str) -> Any:
+    wanted = type(default)
+    if wanted is float and type(value) is int:
+        value = float(value)
+    if type(value) is not wanted:
+        raise ConfigError(f"{name} must be of type {wanted.__name__}: {value!r}")
+    choices = setting.metadata["choices"]
+    if choices and value not in choices:
+        raise ConfigError(f"{name} must be one of {', '.join(choices)}: {value!r}")
+    low, high = setting.metadata["low"], setting.metadata["high"]
+    if wanted in (int, float) and not low <= value <= high:
+        raise ConfigError(f"{name} must be in [{low:g}, {high:g}]: {value!r}")
+    return value

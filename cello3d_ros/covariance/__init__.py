@@ -1,0 +1,1 @@
+"""Descriptor, model and the estimator that joins them with ICP."""

@@ -1,0 +1,1 @@
+"""Rigid transformations and Gaussians on them."""

@@ -1,0 +1,1 @@
+"""Pairs, sampling, datasets and the training of Theta."""

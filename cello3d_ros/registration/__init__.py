@@ -1,0 +1,1 @@
+"""ICP and the overlap of two clouds."""
