@@ -1,0 +1,204 @@
+"""Gaussians on SE(3): sampling, change of side, compounding, divergence and distance.
+
+A pose ``T`` with a covariance ``Y`` (6, 6), ordered (u, omega), is random on one of two sides:
+right, ``T exp(xi)`` (frame of the moving cloud), or left, ``exp(xi) T`` (frame of the one that
+stays), with ``xi ~ N(0, Y)``.  Everything is batched over leading axes.
+Source: Barfoot & Furgale 2014, "Associating uncertainty with three-dimensional poses".
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cello3d_ros.geometry.se3 import Array, adjoint, inverse
+
+_MARGIN = 1e-14  # smallest eigenvalue of a correlation matrix that rounding cannot have made
+_ASYMMETRY = 1e-9  # largest difference of mirrored correlations that rounding can have made
+
+
+class GaussianPose(NamedTuple):
+    """A pose and the covariance of its perturbation.  T: (..., 4, 4); Y: (..., 6, 6)."""
+
+    T: Array
+    Y: Array
+
+
+def sampled_covariance(xi: ArrayLike, centre: ArrayLike | None = None) -> Array:
+    """Return ``sum xi xi^T / (n - 1)`` about ``centre``, which is zero (ground truth) if None.
+
+    xi: (..., n, d), n >= 2; centre: (..., d).  Returns (..., d, d).
+    Source: Landry et al. 2019, Sec. IV-D: the truth is the mean, so a bias counts as spread.
+    """
+    xi = np.asarray(xi, dtype=np.float64)
+    if xi.ndim < 2 or xi.shape[-2] < 2:
+        raise ValueError(f"a covariance needs at least two samples: shape {xi.shape}")
+    if centre is not None:
+        xi = xi - np.asarray(centre, dtype=np.float64)[..., None, :]
+    return symmetrized(_transposed(xi) @ xi / (xi.shape[-2] - 1))
+
+
+def to_left(T: ArrayLike, Y: ArrayLike) -> Array:
+    """Return ``Ad(T) Y Ad(T)^T``: the left covariance of a right one.  (..., 6, 6)."""
+    Ad = adjoint(T)
+    return symmetrized(Ad @ np.asarray(Y, dtype=np.float64) @ _transposed(Ad))
+
+
+def to_right(T: ArrayLike, Y: ArrayLike) -> Array:
+    """Return ``Ad(T)^-1 Y Ad(T)^-T``: the right covariance of a left one.  (..., 6, 6)."""
+    return to_left(inverse(T), Y)
+
+
+def compound_left(
+    T1: ArrayLike, Y1: ArrayLike, T2: ArrayLike, Y2: ArrayLike, order: int = 4
+) -> GaussianPose:
+    """Return the pose ``T1 T2`` and its left covariance from two independent left covariances.
+
+    With ``S = Ad(T1) Y2 Ad(T1)^T`` the second order is ``Y1 + S``; the fourth adds
+    ``B/4 + (A1 S + S A1^T + A2 Y1 + Y1 A2^T)/12``.  The fourth order holds while rotations are
+    below a radian or so; only the second is positive definite whatever the spread.
+    T1, T2: (..., 4, 4); Y1, Y2: (..., 6, 6); order: 2 or 4.
+    Source: Barfoot & Furgale 2014, eqs. 54-55.
+    """
+    if order not in (2, 4):
+        raise ValueError(f"compounding is of order 2 or 4, not {order}")
+    T1, T2 = np.asarray(T1, dtype=np.float64), np.asarray(T2, dtype=np.float64)
+    Y1, S = np.asarray(Y1, dtype=np.float64), to_left(T1, Y2)
+    Y = Y1 + S
+    if order == 4:
+        C = _a_matrix(Y1) @ S + _a_matrix(S) @ Y1
+        Y = Y + _b_matrix(Y1, S) / 4 + (C + _transposed(C)) / 12
+    return GaussianPose(T1 @ T2, symmetrized(Y))
+
+
+def compound_right(
+    T1: ArrayLike, Y1: ArrayLike, T2: ArrayLike, Y2: ArrayLike, order: int = 4
+) -> GaussianPose:
+    """Return the pose ``T1 T2`` and its right covariance from two independent right covariances.
+
+    The inverse of ``T1 exp(xi1) T2 exp(xi2)`` is a product of left-perturbed poses, so this is
+    the left form on (T2^-1, Y2), (T1^-1, Y1).  Shapes and order as in ``compound_left``.
+    """
+    Y = compound_left(inverse(T2), Y2, inverse(T1), Y1, order).Y
+    return GaussianPose(np.asarray(T1, dtype=np.float64) @ np.asarray(T2, dtype=np.float64), Y)
+
+
+def kl(Y: ArrayLike, F: ArrayLike) -> Array:
+    """Return ``KL(N(0, Y) | N(0, F)) = (tr(F^-1 Y) - d + ln det F - ln det Y) / 2``, in nats.
+
+    Y, F: (..., d, d) positive definite, else numpy's LinAlgError.  Returns (...), never negative:
+    with ``M = chol(F)^-1 chol(Y)`` it is a sum of squares below the diagonal of M and of
+    ``exp(x) - 1 - x``, ``x = ln M_ii^2``, so no determinant is ever formed.
+    """
+    M = _solve_lower(
+        np.linalg.cholesky(np.asarray(F, dtype=np.float64)),
+        np.linalg.cholesky(np.asarray(Y, dtype=np.float64)),
+    )
+    x = 2 * np.log(np.diagonal(M, axis1=-2, axis2=-1))
+    below = np.sum(np.tril(M, -1) ** 2, axis=(-2, -1))
+    return np.asarray(0.5 * (below + np.maximum(np.expm1(x) - x, 0.0).sum(axis=-1)))
+
+
+def mahalanobis(xi: ArrayLike, Y: ArrayLike) -> Array:
+    """Return the distance ``sqrt(xi^T Y^-1 xi)``; its mean is 2.350 in 6 dof and 1.596 in 3.
+
+    xi: (..., d); Y: (..., d, d) positive definite, else numpy's LinAlgError.  Returns (...).
+    """
+    xi = np.asarray(xi, dtype=np.float64)
+    L = np.linalg.cholesky(np.asarray(Y, dtype=np.float64))
+    white = _solve_lower(L, xi[..., None])[..., 0]
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", white, white)))
+
+
+def is_positive_definite(Y: ArrayLike) -> NDArray[np.bool_]:
+    """Return whether each matrix is finite, symmetric and positive definite beyond rounding.
+
+    The verdict is on correlations, so that units and scales do not matter: a determinant of
+    1e-40 is as good as any.  Y: (..., d, d).  Returns (...).
+    """
+    Y = np.asarray(Y, dtype=np.float64)
+    variances = np.diagonal(Y, axis1=-2, axis2=-1)
+    usable = np.isfinite(Y).all(axis=(-2, -1)) & (variances > 0).all(axis=-1)
+    sane = np.where(usable[..., None, None], Y, np.eye(Y.shape[-1]))
+    sigma = np.sqrt(np.diagonal(sane, axis1=-2, axis2=-1))
+    C = sane / sigma[..., :, None] / sigma[..., None, :]
+    usable &= np.abs(C - _transposed(C)).max(axis=(-2, -1)) <= _ASYMMETRY
+    try:
+        np.linalg.cholesky(C - _MARGIN * np.eye(Y.shape[-1]))
+    except np.linalg.LinAlgError:
+        usable &= np.linalg.eigvalsh(C)[..., 0] > _MARGIN
+    return np.asarray(usable)
+
+
+def symmetrized(Y: ArrayLike) -> Array:
+    """Return ``(Y + Y^T) / 2``, symmetric to the last bit.  (..., d, d) -> (..., d, d)."""
+    Y = np.asarray(Y, dtype=np.float64)
+    return 0.5 * (Y + _transposed(Y))
+
+
+def matrix_sqrt(S: ArrayLike) -> Array:
+    """Return the symmetric R with ``R R = S``.  (..., d, d); LinAlgError if not positive."""
+    return _power(S, 0.5)
+
+
+def matrix_inverse_sqrt(S: ArrayLike) -> Array:
+    """Return the symmetric R with ``R S R = I``.  (..., d, d); LinAlgError if not positive."""
+    return _power(S, -0.5)
+
+
+def _power(S: ArrayLike, exponent: float) -> Array:
+    values, vectors = np.linalg.eigh(symmetrized(S))
+    if not (values > 0).all():
+        raise np.linalg.LinAlgError("matrix is not positive definite")
+    return symmetrized((vectors * values[..., None, :] ** exponent) @ _transposed(vectors))
+
+
+def _transposed(A: Array) -> Array:
+    return np.swapaxes(A, -1, -2)
+
+
+def _solve_lower(L: Array, B: Array) -> Array:
+    """Return ``L^-1 B`` by forward substitution.  (..., d, d), (..., d, m)."""
+    d = L.shape[-1]
+    X = np.array(np.broadcast_to(B, np.broadcast_shapes(B.shape, (*L.shape[:-1], B.shape[-1]))))
+    for i in range(d):
+        X[..., i, :] -= (L[..., i : i + 1, :i] @ X[..., :i, :])[..., 0, :]
+        X[..., i, :] /= L[..., i, i, None]
+    return X
+
+
+def _bracket(A: Array) -> Array:
+    """Return ``<<A>> = -tr(A) I + A``.  (..., 3, 3)."""
+    trace = np.einsum("...ii", A)
+    return np.asarray(A - trace[..., None, None] * np.eye(3))
+
+
+def _bracket2(A: Array, B: Array) -> Array:
+    """Return ``<<A, B>> = <<A>> <<B>> + <<B A>>``.  (..., 3, 3)."""
+    return _bracket(A) @ _bracket(B) + _bracket(B @ A)
+
+
+def _a_matrix(Y: Array) -> Array:
+    """Return A of one covariance.  Source: Barfoot & Furgale 2014, eq. 55."""
+    A = np.zeros_like(Y)
+    Yrp = Y[..., :3, 3:]
+    A[..., :3, :3] = A[..., 3:, 3:] = _bracket(Y[..., 3:, 3:])
+    A[..., :3, 3:] = _bracket(Yrp + _transposed(Yrp))
+    return A
+
+
+def _b_matrix(Y: Array, S: Array) -> Array:
+    """Return B of two covariances (r translation, p rotation).  Source: the same, eq. 55."""
+    Yrr, Yrp, Ypp = Y[..., :3, :3], Y[..., :3, 3:], Y[..., 3:, 3:]
+    Srr, Srp, Spp = S[..., :3, :3], S[..., :3, 3:], S[..., 3:, 3:]
+    Ypr, Spr = _transposed(Yrp), _transposed(Srp)
+    B = np.zeros(np.broadcast_shapes(Y.shape, S.shape))
+    B[..., :3, :3] = (
+        _bracket2(Ypp, Srr) + _bracket2(Ypr, Srp) + _bracket2(Yrp, Spr) + _bracket2(Yrr, Spp)
+    )
+    B[..., :3, 3:] = _bracket2(Ypp, Spr) + _bracket2(Ypr, Spp)
+    B[..., 3:, :3] = _transposed(B[..., :3, 3:])
+    B[..., 3:, 3:] = _bracket2(Ypp, Spp)
+    return B
