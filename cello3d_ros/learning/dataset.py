@@ -1,0 +1,352 @@
+"""A dataset on disk: one folder, one manifest, one file a pair.
+
+    DATASET/manifest.json                     format, conventions, configuration, recordings
+    DATASET/pairs/<recording>_<i>_<j>.npz     one pair, accepted or not: it is done
+
+Files appear whole: they are written under a temporary name and moved into place.  The same
+content gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import io
+import json
+import os
+import platform
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cello3d_ros.config import Pipeline, SamplingConfig, config_from, config_to, pipeline_of
+from cello3d_ros.errors import ConfigError, DatasetError
+
+Array = NDArray[np.float64]
+
+FORMAT = 1
+CONVENTIONS = (
+    "T_ref_read maps reading points into the reference frame; xi = (u, omega) = "
+    "log(inverse(T_mean) T_hat); covariances about ground truth, on the reading side"
+)
+_PACKAGES = ("cello3d_ros", "numpy", "scipy", "numba", "scikit-learn")
+_DAMAGE = (  # what reading a damaged file raises
+    *(OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError),
+    *(struct.error, zlib.error, zipfile.BadZipFile),
+)
+_DTYPES = {
+    "T_mean": np.float64,
+    "xi": np.float64,
+    "kept": np.bool_,
+    "covariance": np.float64,
+    "descriptors": np.float32,
+    "rotations_rad": np.float64,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairRecord:
+    """What brute force found out about one pair; a rejected pair leaves out what it lacks.
+
+    ``kept`` says which of ``xi`` made the covariance Y, about ground truth, reading side.
+    ``descriptors[r]`` and, by adjoints, the covariance describe the pair turned about z of the
+    reading frame by ``rotations_rad[r]``; ``covariance`` and ``shapes`` themselves are not turned.
+    """
+
+    recording: str
+    i: int  # reference
+    j: int  # reading
+    accepted: bool
+    T_mean: Array  # (4, 4) ground truth
+    reason: str = ""  # why rejected: "no_overlap", "offset", "no_cluster", "singular" ...
+    xi: Array = field(default_factory=lambda: np.zeros((0, 6)))  # (n, 6) all finite results
+    kept: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))  # (n,)
+    n_converged: int = 0
+    n_failed: int = 0
+    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (6, 6) Y
+    descriptors: NDArray[np.float32] = field(  # (n_rotations, D)
+        default_factory=lambda: np.zeros((0, 0), np.float32)
+    )
+    rotations_rad: Array = field(default_factory=lambda: np.zeros(0))  # (n_rotations,)
+    shapes: dict[str, Array] = field(default_factory=dict)  # "hessian", "sandwich": (6, 6)
+    overlap_ratio: float = 0.0
+
+    @property
+    def key(self) -> tuple[str, int, int]:
+        """Name of the pair: recording, reference, reading."""
+        return self.recording, self.i, self.j
+
+
+_FIELDS = tuple(
+    setting.name for setting in dataclasses.fields(PairRecord) if setting.name != "shapes"
+)
+
+
+class Dataset:
+    """An open dataset folder; iterating gives the records ordered by recording, i, j."""
+
+    def __init__(self, path: Path, manifest: dict[str, Any]) -> None:
+        self.path = path
+        self._manifest = manifest
+        try:
+            config = config_from(manifest["configuration"], str(path / "manifest.json"))
+        except (ConfigError, KeyError) as error:
+            raise DatasetError(
+                f"{path}: the manifest's configuration is damaged: {error}"
+            ) from None
+        self.pipeline: Pipeline = pipeline_of(config)
+        self.sampling: SamplingConfig = config.sampling
+
+    @property
+    def recordings(self) -> dict[str, dict[str, Any]]:
+        """Facts about each recording as given to ``add_recording``."""
+        return dict(self._manifest["recordings"])
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Packages with which the folder was begun."""
+        return dict(self._manifest["versions"])
+
+    def add_recording(self, name: str, facts: dict[str, Any]) -> None:
+        """Enter a recording in the manifest.  Raises DatasetError if its facts have changed."""
+        _check_name(name)
+        known = self._manifest["recordings"].get(name)
+        if known is None:
+            recordings = {**self._manifest["recordings"], name: facts}
+            self._manifest["recordings"] = dict(sorted(recordings.items()))
+            _write_manifest(self.path, self._manifest)
+        elif change := _first_difference(known, json.loads(json.dumps(facts))):
+            raise DatasetError(f"{self.path} holds another recording named {name!r}: {change}")
+
+    def keys(self) -> list[tuple[str, int, int]]:
+        """Return the pairs on disk, damaged ones too, ordered by recording, i, j."""
+        return sorted(_key_of(path) for path in (self.path / "pairs").glob("[!.]*.npz"))
+
+    def has(self, recording: str, i: int, j: int) -> bool:
+        """Return whether the pair is there and undamaged."""
+        if not self._file(recording, i, j).is_file():
+            return False
+        try:
+            self.read(recording, i, j)
+        except DatasetError:
+            return False
+        return True
+
+    def read(self, recording: str, i: int, j: int) -> PairRecord:
+        """Return one record.  Raises DatasetError if it is missing or damaged."""
+        path = self._file(recording, i, j)
+        try:
+            record = _unpacked(_read_arrays(path))
+            _check(record)
+        except FileNotFoundError:
+            raise DatasetError(f"{self.path} has no pair {recording} {i} {j}") from None
+        except _DAMAGE as error:
+            raise DatasetError(f"{path} is damaged, sample it again: {error}") from None
+        if record.key != (recording, i, j):
+            raise DatasetError(f"{path} holds another pair: {record.key}")
+        return record
+
+    def write(self, record: PairRecord) -> None:
+        """Store one record, in place of an older one.  Raises DatasetError on unfit values."""
+        path = self._file(*record.key)
+        try:
+            _check(record)
+        except ValueError as error:
+            raise DatasetError(f"refused to write {path}: {error}") from None
+        path.parent.mkdir(exist_ok=True)
+        arrays: Any = _packed(record)
+        _write_whole(path, lambda stream: np.savez_compressed(stream, **arrays))
+
+    def __iter__(self) -> Iterator[PairRecord]:
+        for key in self.keys():
+            yield self.read(*key)
+
+    def __len__(self) -> int:
+        return len(self.keys())
+
+    def _file(self, recording: str, i: int, j: int) -> Path:
+        _check_name(recording)
+        return self.path / "pairs" / f"{recording}_{i}_{j}.npz"
+
+
+def open_dataset(
+    path: Path | str,
+    pipeline: Pipeline | None = None,
+    sampling: SamplingConfig | None = None,
+    create: bool = False,
+) -> Dataset:
+    """Open a dataset folder; with ``create``, begin one where there is none.
+
+    Settings that are given must be those of the folder: DatasetError names the first that is not.
+    With ``create``, leftovers of interrupted writes are removed: one process samples into a folder.
+    """
+    path = Path(path)
+    if create:
+        for leftover in [*path.glob(".*.tmp"), *path.glob("pairs/.*.tmp")]:
+            leftover.unlink(missing_ok=True)
+        if not (path / "manifest.json").exists():
+            _begin(path, pipeline or Pipeline(), sampling or SamplingConfig())
+    dataset = Dataset(path, _read_manifest(path))
+    theirs = _configuration(dataset.pipeline, dataset.sampling)
+    ours = _configuration(pipeline or dataset.pipeline, sampling or dataset.sampling)
+    if change := _first_difference(theirs, ours):
+        raise DatasetError(f"{path} was made with other settings: there {change}")
+    return dataset
+
+
+def _begin(path: Path, pipeline: Pipeline, sampling: SamplingConfig) -> None:
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise DatasetError(f"{path} exists and is not a dataset: it has no manifest.json")
+    path.mkdir(parents=True, exist_ok=True)
+    manifest = {
+        "format": FORMAT,
+        "conventions": CONVENTIONS,
+        "configuration": _configuration(pipeline, sampling),
+        "versions": _versions(),
+        "recordings": {},
+    }
+    _write_manifest(path, manifest)
+
+
+def _configuration(pipeline: Pipeline, sampling: SamplingConfig) -> dict[str, dict[str, Any]]:
+    return {**config_to(pipeline_of(pipeline)), "sampling": dataclasses.asdict(sampling)}
+
+
+def _versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    return versions
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    file = path / "manifest.json"
+    try:
+        manifest = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DatasetError(f"{path} is not a dataset: it has no manifest.json") from None
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"cannot read {file}: {error}") from None
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        found = manifest.get("format") if isinstance(manifest, dict) else manifest
+        raise DatasetError(f"{file} has format {found!r}, this version reads {FORMAT}")
+    for name in ("configuration", "versions", "recordings"):
+        if not isinstance(manifest.get(name), dict):
+            raise DatasetError(f"{file} lacks {name!r}")
+    return manifest
+
+
+def _write_manifest(path: Path, manifest: dict[str, Any]) -> None:
+    text = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
+    _write_whole(path / "manifest.json", lambda stream: stream.write(text.encode()))
+
+
+def _write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write a file that is either there and complete, or not there."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(partial, "wb") as stream:
+            write(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(partial, path)
+    except OSError as error:
+        raise DatasetError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read a pair file, every checksum first: numpy would parse what is damaged."""
+    blob = path.read_bytes()
+    with zipfile.ZipFile(io.BytesIO(blob)) as archive:
+        if damaged := archive.testzip():
+            raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
+    with np.load(io.BytesIO(blob), allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
+
+
+def _packed(record: PairRecord) -> dict[str, NDArray[Any]]:
+    arrays: dict[str, NDArray[Any]] = {
+        name: np.asarray(getattr(record, name), _DTYPES.get(name)) for name in _FIELDS
+    }
+    names = sorted(record.shapes)
+    arrays["shape_names"] = np.asarray(names, np.str_)
+    arrays["shapes"] = np.array([record.shapes[name] for name in names]).reshape(-1, 6, 6)
+    return arrays
+
+
+def _unpacked(arrays: dict[str, NDArray[Any]]) -> PairRecord:
+    values: dict[str, Any] = {
+        name: arrays[name] if name in _DTYPES else arrays[name].item() for name in _FIELDS
+    }
+    shapes = zip(arrays["shape_names"].tolist(), arrays["shapes"], strict=True)
+    return PairRecord(**values, shapes=dict(shapes))
+
+
+def _check(record: PairRecord) -> None:
+    """Raise ValueError unless the record may stand in a dataset."""
+    arrays = _packed(record)
+    for name, value in arrays.items():
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            raise ValueError(f"{name} is not finite")
+    n_samples = len(record.xi)
+    if arrays["xi"].shape != (n_samples, 6) or arrays["kept"].shape != (n_samples,):
+        raise ValueError(f"xi {arrays['xi'].shape} and kept {arrays['kept'].shape} disagree")
+    if arrays["T_mean"].shape != (4, 4):
+        raise ValueError(f"T_mean has shape {arrays['T_mean'].shape}, not (4, 4)")
+    if not record.accepted:
+        if not record.reason:
+            raise ValueError("a rejected pair needs a reason")
+        return
+    shape, n_rotations = arrays["descriptors"].shape, len(record.rotations_rad)
+    if n_rotations == 0 or len(shape) != 2 or shape[0] != n_rotations or shape[1] == 0:
+        raise ValueError(f"{n_rotations} rotations, descriptors {shape}")
+    for name, Y in {"covariance": record.covariance, **record.shapes}.items():
+        _check_covariance(name, Y)
+
+
+def _check_covariance(name: str, Y: Array) -> None:
+    if Y.shape != (6, 6):
+        raise ValueError(f"{name} has shape {Y.shape}, not (6, 6)")
+    if np.abs(Y - Y.T).max() > 1e-9 * np.abs(Y).max():
+        raise ValueError(f"{name} is not symmetric")
+    try:
+        np.linalg.cholesky(Y)
+    except np.linalg.LinAlgError:
+        raise ValueError(f"{name} is not positive definite") from None
+
+
+def _check_name(recording: str) -> None:
+    if not recording or recording.startswith(".") or set(recording) & set('/\\:*?"<>|\0'):
+        raise DatasetError(f"a recording cannot be named {recording!r}: it names files")
+
+
+def _key_of(path: Path) -> tuple[str, int, int]:
+    try:
+        recording, i, j = path.stem.rsplit("_", 2)
+        return recording, int(i), int(j)
+    except ValueError:
+        raise DatasetError(f"{path} is not the name of a pair: <recording>_<i>_<j>.npz") from None
+
+
+def _first_difference(theirs: dict[str, Any], ours: dict[str, Any], where: str = "") -> str:
+    """Name the first value that differs: ``sampling.seed is 0, here 1``; empty if none does."""
+    for name in [*theirs, *(name for name in ours if name not in theirs)]:
+        a, b = theirs.get(name), ours.get(name)
+        if isinstance(a, dict) and isinstance(b, dict):
+            if change := _first_difference(a, b, f"{where}{name}."):
+                return change
+        elif a != b:
+            return f"{where}{name} is {a}, here {b}"
+    return ""

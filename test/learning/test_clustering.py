@@ -1,0 +1,112 @@
+"""Check 18 of the design and the two figures of the paper: the cylinder and the hallway."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cello3d_ros.config import SamplingConfig
+from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.learning.clustering import nearest_cluster, offset
+
+CONFIG = SamplingConfig()
+NOISE = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005])
+
+
+def kept(xi: Array) -> np.ndarray:
+    return nearest_cluster(
+        xi, CONFIG.cluster_scale_m, CONFIG.cluster_scale_rad, CONFIG.cluster_min_share
+    )
+
+
+def noise(n: int, seed: int = 0) -> Array:
+    return np.random.default_rng(seed).normal(size=(n, 6)) * NOISE
+
+
+@pytest.mark.parametrize("n", [65, 500, 5000])
+def test_of_two_clusters_the_one_nearest_ground_truth_is_kept(n: int) -> None:
+    near, far = noise(n), noise(2 * n, 1) + [0.6, 0, 0, 0, 0, 0.3]
+    mask = kept(np.concatenate([far, near]))
+    assert not mask[: 2 * n].any()
+    assert mask[2 * n :].mean() > 0.98
+    xi = np.concatenate([far, near])[mask]
+    ratio = np.linalg.solve(np.diag(NOISE**2), xi.T @ xi / (len(xi) - 1))
+    divergence = 0.5 * (np.trace(ratio) - 6 - np.linalg.slogdet(ratio)[1])
+    assert divergence < {65: 0.168, 500: 0.021, 5000: 0.01}[n] * 1.6
+
+
+def test_a_constant_offset_stays_in_the_covariance() -> None:
+    b = np.array([0.1, -0.05, 0.02, 0.01, 0.0, 0.03])
+    xi = np.tile(b, (400, 1))
+    assert kept(xi).all()
+    np.testing.assert_allclose(xi.T @ xi / 399, np.outer(b, b) * 400 / 399, rtol=1e-12)
+
+
+def test_cylinder_loses_the_upside_down_ring_and_keeps_the_free_axis() -> None:
+    rng = np.random.default_rng(2)
+    line = noise(4000)
+    line[:, 5] += rng.normal(size=4000) * np.sqrt(CONFIG.variance)
+    ring = noise(1000, 3)
+    axis = rng.uniform(0, 2 * np.pi, 1000)
+    ring[:, 3] += np.pi * np.cos(axis)
+    ring[:, 4] += np.pi * np.sin(axis)
+    mask = kept(np.concatenate([line, ring]))
+    assert not mask[4000:].any()
+    assert mask[:4000].mean() > 0.97
+    assert line[mask[:4000], 5].std() > 0.9 * np.sqrt(CONFIG.variance)
+
+
+def test_the_ring_goes_although_its_mean_is_nearest_to_ground_truth() -> None:
+    axis = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
+    ring = noise(1000, 4)
+    ring[:, 3:5] += np.pi * np.stack([np.cos(axis), np.sin(axis)], axis=1)
+    biased = noise(1000, 5) + [0.2, 0, 0, 0, 0, 0.1]
+    assert np.linalg.norm(ring.mean(axis=0)) < np.linalg.norm(biased.mean(axis=0))
+    mask = kept(np.concatenate([ring, biased]))
+    assert not mask[:1000].any()
+    assert mask[1000:].mean() > 0.98
+
+
+def test_hallway_with_regular_pillars_keeps_the_middle_of_three_clusters() -> None:
+    xi = noise(3000)
+    xi[:1000, 0] -= 1.0
+    xi[2000:, 0] += 1.0
+    mask = kept(xi)
+    assert not mask[:1000].any()
+    assert not mask[2000:].any()
+    assert mask[1000:2000].mean() > 0.98
+
+
+def test_featureless_hallway_keeps_its_free_axis() -> None:
+    xi = noise(2000)
+    xi[:, 0] += np.random.default_rng(6).normal(size=2000) * np.sqrt(CONFIG.variance)
+    assert xi[kept(xi), 0].std() > 0.9 * np.sqrt(CONFIG.variance)
+
+
+def test_scales_are_separate_for_translation_and_rotation() -> None:
+    xi = np.zeros((40, 6))
+    xi[20:, 0] = 0.09
+    assert nearest_cluster(xi, 0.1, 0.05, 0.01).all()
+    assert nearest_cluster(xi, 0.05, 0.1, 0.01).sum() == 20
+    xi[20:, 0], xi[20:, 3] = 0.0, 0.09
+    assert nearest_cluster(xi, 0.1, 0.05, 0.01).sum() == 20
+
+
+def test_scattered_samples_make_no_cluster() -> None:
+    xi = np.random.default_rng(7).uniform(-3, 3, size=(50, 6))
+    assert not kept(xi).any()
+    assert kept(np.zeros((0, 6))).shape == (0,)
+    assert not kept(np.zeros((1, 6))).any()
+
+
+def test_the_order_of_the_samples_does_not_matter() -> None:
+    xi = np.concatenate([noise(200), noise(200, 1) + 0.5])
+    order = np.random.default_rng(8).permutation(400)
+    np.testing.assert_array_equal(kept(xi[order]), kept(xi)[order])
+
+
+def test_offset_is_the_mean_over_all_samples() -> None:
+    xi = np.tile([3.0, 4.0, 0, 0, 0, 0.5], (10, 1))
+    xi[::2, 3] += 1.0
+    xi[1::2, 3] -= 1.0
+    assert offset(xi) == pytest.approx((5.0, 0.5))
