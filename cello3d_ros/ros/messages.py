@@ -1,0 +1,113 @@
+"""Arrays to and from nav_msgs and geometry_msgs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+
+from cello3d_ros.errors import Cello3dError
+from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.ros.odometry import checked_pose
+
+_CONDITION = 1e-13  # least ratio of eigenvalues that still is positive definite when rounded
+
+
+class CovarianceError(Cello3dError):
+    """A covariance cannot be published."""
+
+
+def stamp_ns_of(message: Any) -> int:
+    """Return the stamp of a message with a header, in nanoseconds."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def time_of(stamp_ns: int) -> Time:
+    """Return a stamp as a builtin_interfaces/Time."""
+    sec, nanosec = divmod(int(stamp_ns), 1_000_000_000)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def pose_from(pose: Pose) -> Array:
+    """Return a geometry_msgs/Pose as a (4, 4) matrix.  Raises OdometryError when damaged."""
+    p, q = pose.position, pose.orientation
+    return checked_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+
+
+def pose_to(T: Array) -> Pose:
+    """Return a (4, 4) pose as a geometry_msgs/Pose."""
+    pose = Pose()
+    p, q = pose.position, pose.orientation
+    p.x, p.y, p.z = (float(value) for value in T[:3, 3])
+    q.x, q.y, q.z, q.w = (float(value) for value in se3.quaternion(T))
+    return pose
+
+
+def odometry_to(stamp_ns: int, frame_id: str, child_frame_id: str, T: Array) -> Odometry:
+    """Return nav_msgs/Odometry with the pose of ``child_frame_id`` in ``frame_id``."""
+    message = Odometry()
+    message.header.stamp = time_of(stamp_ns)
+    message.header.frame_id = frame_id
+    message.child_frame_id = child_frame_id
+    message.pose.pose = pose_to(T)
+    return message
+
+
+def ros_covariance(
+    Y: Array, R_header_read: Array, floor_sigma_m: float, floor_sigma_rad: float, ceiling: float
+) -> Array:
+    """Return the covariance of a PoseWithCovariance from a reading-side one.
+
+    ``C = B Y B^T`` with ``B = blkdiag(R, R)``, to first order: of the additive error of the
+    position and of the rotation about fixed axes, both along the axes of header.frame_id.
+    Y: (6, 6), ordered (u, omega).  R_header_read: (3, 3).  Returns (6, 6) in m^2 and rad^2,
+    exactly symmetric, positive definite, ``C - diag(floor_sigma_m^2, floor_sigma_rad^2)``
+    positive semidefinite and no eigenvalue above ``ceiling``.  Raises CovarianceError for a Y that is not finite.
+    """
+    if np.shape(Y) != (6, 6) or not np.isfinite(Y).all():
+        raise CovarianceError("the covariance is not finite")
+    B = np.kron(np.eye(2), R_header_read)
+    C = _symmetric(B @ Y @ B.T)
+    unit = np.repeat([floor_sigma_m, floor_sigma_rad], 3)
+    unit2 = np.outer(unit, unit)
+    C = unit2 * _clamped(C / unit2, 1.0, np.inf)
+    largest = min(float(np.linalg.norm(C, 2)), ceiling)
+    return _clamped(C, _CONDITION * largest, ceiling)
+
+
+def reading_covariance(C: Array, R_header_read: Array) -> Array:
+    """Return the reading-side covariance of a PoseWithCovariance's: ``Y = B^T C B``.  (6, 6)."""
+    B = np.kron(np.eye(2), R_header_read)
+    return _symmetric(B.T @ np.asarray(C, dtype=np.float64).reshape(6, 6) @ B)
+
+
+def pose_with_covariance(
+    stamp_ns: int, frame_id: str, T: Array, covariance: Array
+) -> PoseWithCovarianceStamped:
+    """Return the message of a pose and its covariance in the ROS convention (ros_covariance)."""
+    cells = np.ascontiguousarray(covariance, dtype=np.float64).reshape(36)
+    if not np.isfinite(cells).all() or not se3.is_rigid(T):
+        raise CovarianceError("the pose or its covariance is not finite")
+    message = PoseWithCovarianceStamped()
+    message.header.stamp = time_of(stamp_ns)
+    message.header.frame_id = frame_id
+    message.pose.pose = pose_to(T)
+    message.pose.covariance = cells
+    return message
+
+
+def _symmetric(A: Array) -> Array:
+    return np.asarray(0.5 * (A + A.T))
+
+
+def _clamped(A: Array, low: float, high: float) -> Array:
+    """Return a symmetric matrix with its eigenvalues moved into [low, high]."""
+    values, vectors = np.linalg.eigh(A)
+    if low <= values[0] and values[-1] <= high:
+        return _symmetric(A)
+    return _symmetric((vectors * np.clip(values, low, high)) @ vectors.T)
