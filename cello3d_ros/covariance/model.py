@@ -1,0 +1,331 @@
+"""The learned model: from a pair's descriptor, and its cheap shape, to a covariance.
+
+``F(d) = sum_k w_k Y_k`` with ``w_k`` proportional to ``exp(-rho_k)`` and
+``rho_k = |Theta (d - d_k)|^2`` over the training examples (d_k, Y_k); a share of the training mean
+is mixed in, and the Y_k may be relative to the pair's own shape S (Hessian or sandwich).
+Covariances are ordered (u, omega) and belong to the reading side, ``T_hat = T_mean exp(xi)``.
+Source: Landry et al. 2019, Sec. IV-B; relative covariances are this project's own.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cello3d_ros.config import (
+    PIPELINE,
+    Config,
+    Pipeline,
+    SamplingConfig,
+    config_from,
+    config_to,
+    pipeline_of,
+)
+from cello3d_ros.covariance.archive import read_arrays, write_arrays
+from cello3d_ros.errors import ConfigError, ModelError
+from cello3d_ros.geometry.gaussian import is_positive_definite, matrix_sqrt, symmetrized
+from cello3d_ros.geometry.se3 import Array
+
+FORMAT = "cello3d-model"
+FORMAT_VERSION = 1
+CONVENTIONS = {
+    "order": "u omega",
+    "side": "reading: T_hat = T_mean exp(xi)",
+    "relative": "S^-1/2 Y S^-1/2, symmetric root",
+    "weight": "exp(-|Theta (d - d_k)|^2)",
+}
+SHAPES = ("none", "hessian", "sandwich")
+
+_MAX_HEADER_BYTES = 16 * 1024**2
+_ARRAYS = ("theta", "mean", "scale", "projections", "covariances")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """Theta and the training examples, with the settings they were made with.
+
+    theta: (r, D).  mean, scale: (D,), scaler of the descriptors, ``(d - mean) / scale``.
+    projections: (N, r), Theta applied to the standardised training descriptors.
+    covariances: (N, 6, 6), of the sampled registrations; ``S^-1/2 Y S^-1/2`` unless shape is none.
+    shape: what they are relative to.  mean_weight: share of their mean in every prediction.
+    cutoff_rho: examples with ``rho - min(rho)`` beyond this weigh nothing; inf is no cut-off.
+    provenance: recordings, seeds, versions, settings, figures; anything that JSON can hold.
+    Raises ModelError naming what does not fit.  The arrays are read-only.
+    """
+
+    theta: Array
+    mean: Array
+    scale: Array
+    projections: Array
+    covariances: Array
+    shape: str = "none"
+    mean_weight: float = 0.0
+    cutoff_rho: float = math.inf
+    pipeline: Pipeline = field(default_factory=Pipeline)
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in _ARRAYS:
+            object.__setattr__(self, name, _frozen(name, getattr(self, name)))
+        object.__setattr__(self, "provenance", _as_json(self.provenance))
+        _check_extents(self)
+        _check_settings(self)
+        for name in ("mean_weight", "cutoff_rho"):
+            object.__setattr__(self, name, _number(name, getattr(self, name)))
+        if not (fine := is_positive_definite(self.covariances)).all():
+            raise ModelError(f"covariance {np.argmin(fine)} is not positive definite")
+
+    @property
+    def n_examples(self) -> int:
+        """Number of training examples N."""
+        return len(self.projections)
+
+    @property
+    def n_features(self) -> int:
+        """Length of a descriptor D."""
+        return int(self.theta.shape[1])
+
+    @cached_property
+    def mean_covariance(self) -> Array:
+        """Mean of the training covariances (relative ones if shape is not none).  (6, 6)."""
+        return symmetrized(self.covariances.mean(axis=0))
+
+
+class Prediction(NamedTuple):
+    """A covariance and the evidence for trust in it.
+
+    covariance: (6, 6), ordered (u, omega), reading side, exactly symmetric, positive definite.
+    nearest_rho: distance of the nearest example.  effective_neighbors: ``1 / sum w_k^2``.
+    """
+
+    covariance: Array
+    nearest_rho: float
+    effective_neighbors: float
+
+
+def project(descriptors: ArrayLike, theta: Array, mean: Array, scale: Array) -> Array:
+    """Return ``Theta (d - mean) / scale``; rho is a squared length there.  (..., D) -> (..., r)."""
+    d = np.asarray(descriptors, dtype=np.float64)
+    return np.asarray(((d - mean) / scale) @ theta.T)
+
+
+def weigh(rho: Array, cutoff_rho: float = math.inf) -> Array:
+    """Return weights proportional to ``exp(-rho)`` that sum to 1.  (..., N) -> (..., N).
+
+    The minimum is subtracted first, so that the nearest example weighs most and never 0/0.
+    """
+    excess = rho - rho.min(axis=-1, keepdims=True)
+    w = np.where(excess <= cutoff_rho, np.exp(-excess), 0.0)
+    return np.asarray(w / w.sum(axis=-1, keepdims=True))
+
+
+def predict(model: Model, descriptor: ArrayLike, S: ArrayLike | None = None) -> Prediction:
+    """Return ``F = S^1/2 [(1 - a) sum_k w_k Y_k + a mean(Y)] S^1/2``, a the mean's weight.
+
+    descriptor: (D,).  S: (6, 6), the pair's shape that ``model.shape`` names, reading side; not
+    looked at when that is none.  Raises ModelError where either does not fit the model.
+    """
+    d = np.asarray(descriptor, dtype=np.float64)
+    if d.shape != (model.n_features,):
+        raise ModelError(f"descriptor has shape {d.shape}, the model needs ({model.n_features},)")
+    if not np.isfinite(d).all():
+        raise ModelError("descriptor is not finite")
+    with np.errstate(over="ignore", invalid="ignore"):
+        offset = model.projections - project(d, model.theta, model.mean, model.scale)
+        rho = np.einsum("kr,kr->k", offset, offset)
+    if not np.isfinite(nearest := float(rho.min())):
+        raise ModelError("descriptor is too far from every example for a distance")
+    w = weigh(rho, model.cutoff_rho)
+    F = (w @ model.covariances.reshape(-1, 36)).reshape(6, 6)
+    F = (1.0 - model.mean_weight) * F + model.mean_weight * model.mean_covariance
+    F = _scaled(symmetrized(F), S, model.shape)
+    return Prediction(F, nearest, float(1.0 / (w @ w)))
+
+
+def constant_model(covariance: ArrayLike, n_features: int, **settings: Any) -> Model:
+    """Return the model of one example, which predicts it everywhere: the baseline and fallback.
+
+    covariance: (6, 6), relative if ``shape`` says so; settings: the other fields of Model.
+    """
+    return Model(
+        theta=np.zeros((1, n_features)),
+        mean=np.zeros(n_features),
+        scale=np.ones(n_features),
+        projections=np.zeros((1, 1)),
+        covariances=np.asarray(covariance, dtype=np.float64)[None],
+        **settings,
+    )
+
+
+def save_model(model: Model, path: Path | str) -> None:
+    """Write the model as one .npz without pickle, complete or not at all.  Raises ModelError."""
+    try:
+        header = json.dumps(_header(model), allow_nan=False, indent=1).encode()
+    except ValueError as error:
+        raise ModelError(f"cannot write {path}: a setting is not finite: {error}") from None
+    if len(header) > _MAX_HEADER_BYTES:
+        raise ModelError(f"cannot write {path}: provenance of {len(header)} bytes is too long")
+    arrays: dict[str, NDArray[Any]] = {name: getattr(model, name) for name in _ARRAYS}
+    write_arrays(path, {"header": np.frombuffer(header, dtype=np.uint8), **arrays})
+
+
+def load_model(path: Path | str) -> Model:
+    """Read a model, every bit as saved.  Raises ModelError naming the file and what is wrong."""
+    header = _read_header(path)
+    arrays = read_arrays(path, dict.fromkeys(_ARRAYS, "<f8"))
+    cutoff = header["cutoff_rho"]
+    try:
+        config = config_from(header["config"])
+        return Model(
+            **arrays,
+            shape=header["shape"],
+            mean_weight=header["mean_weight"],
+            cutoff_rho=math.inf if cutoff is None else cutoff,
+            pipeline=pipeline_of(config),
+            sampling=config.sampling,
+            provenance=header["provenance"],
+        )
+    except (ModelError, ConfigError, OverflowError) as error:
+        raise ModelError(f"{path}: {error}") from None
+
+
+def shipped_model_path() -> Path:
+    """Return the path of the model that comes with the package."""
+    return Path(str(importlib.resources.files("cello3d_ros").joinpath("models", "general.npz")))
+
+
+def _header(model: Model) -> dict[str, Any]:
+    sections = {name: getattr(model.pipeline, name) for name in PIPELINE}
+    config = config_to(Config(**sections, sampling=model.sampling))
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "conventions": CONVENTIONS,
+        "config": {name: config[name] for name in (*PIPELINE, "sampling")},
+        "shape": model.shape,
+        "mean_weight": model.mean_weight,
+        "cutoff_rho": None if math.isinf(model.cutoff_rho) else model.cutoff_rho,
+        "provenance": model.provenance,
+    }
+
+
+def _read_header(path: Path | str) -> dict[str, Any]:
+    """Return the structured part, checked for format, version, conventions and completeness."""
+    data = read_arrays(path, {"header": "|u1"})["header"]
+    if data.size > _MAX_HEADER_BYTES:
+        raise ModelError(f"{path}: item 'header' has {data.size} bytes, too many")
+    try:
+        header = json.loads(data.tobytes())
+    except (ValueError, RecursionError) as error:
+        raise ModelError(f"{path}: the header is not JSON: {error}") from None
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise ModelError(f"{path}: the header is not that of a {FORMAT} file")
+    if (version := header.get("format_version")) != FORMAT_VERSION:
+        raise ModelError(
+            f"{path}: format version {version!r}, this package reads {FORMAT_VERSION}"
+        )
+    _check_items(header, _header(constant_model(np.eye(6), 1)), f"{path}: header")
+    if header["conventions"] != CONVENTIONS:
+        raise ModelError(f"{path}: conventions are {header['conventions']}, not {CONVENTIONS}")
+    return header
+
+
+def _check_items(found: Mapping[str, Any], wanted: Mapping[str, Any], where: str) -> None:
+    """Raise ModelError for a missing item; settings within a section may be missing."""
+    for name in wanted:
+        if name not in found:
+            raise ModelError(f"{where}: item {name!r} is missing")
+    if not isinstance(found["config"], dict):
+        raise ModelError(f"{where}: item 'config' holds no sections")
+    for name in wanted["config"]:
+        if name not in found["config"]:
+            raise ModelError(f"{where}: section {name!r} of 'config' is missing")
+
+
+def _scaled(F: Array, S: ArrayLike | None, shape: str) -> Array:
+    """Return ``S^1/2 F S^1/2``, or F itself when covariances are not relative."""
+    if shape != "none":
+        if S is None:
+            raise ModelError(f"the model is relative to the {shape} of a pair, and none is given")
+        S = np.asarray(S, dtype=np.float64)
+        if S.shape != (6, 6) or not is_positive_definite(S):
+            raise ModelError(f"the {shape} of the pair is not a positive definite 6x6 matrix")
+        try:
+            root = matrix_sqrt(S)
+        except np.linalg.LinAlgError:
+            raise ModelError(f"the {shape} of the pair is singular to rounding") from None
+        F = symmetrized(root @ F @ root)
+    if not is_positive_definite(F):
+        raise ModelError("the predicted covariance is not positive definite")
+    return F
+
+
+def _frozen(name: str, value: ArrayLike) -> Array:
+    """Return a read-only float64 view, and a copy only where one is needed."""
+    try:
+        array = np.ascontiguousarray(value, dtype=np.float64).view()
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"{name} is not an array of numbers: {error}") from None
+    if not np.isfinite(array).all():
+        raise ModelError(f"{name} is not finite")
+    array.flags.writeable = False
+    return array
+
+
+def _as_json(provenance: object) -> dict[str, Any]:
+    """Return an own copy in the form that a file gives back (lists for tuples)."""
+    try:
+        copy = json.loads(json.dumps(provenance, allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ModelError(f"provenance cannot be written as JSON: {error}") from None
+    if not isinstance(copy, dict):
+        raise ModelError(f"provenance must be a mapping: {provenance!r}")
+    return copy
+
+
+def _check_extents(model: Model) -> None:
+    """Raise ModelError where the shapes of the arrays do not fit together."""
+    if model.theta.ndim != 2 or model.projections.ndim != 2 or not model.projections.size:
+        raise ModelError(
+            "theta and projections must be matrices and not empty: "
+            f"{model.theta.shape}, {model.projections.shape}"
+        )
+    r, D = model.theta.shape
+    N = len(model.projections)
+    wanted = {
+        "mean": (D,),
+        "scale": (D,),
+        "projections": (N, r),
+        "covariances": (N, 6, 6),
+    }
+    for name, extents in wanted.items():
+        if (found := getattr(model, name).shape) != extents:
+            raise ModelError(f"{name} has shape {found}, expected {extents}")
+
+
+def _check_settings(model: Model) -> None:
+    """Raise ModelError for a scale, shape, weight or cut-off out of range."""
+    if not (model.scale > 0).all():
+        raise ModelError("scale is not positive")
+    if model.shape not in SHAPES:
+        raise ModelError(f"shape must be one of {', '.join(SHAPES)}: {model.shape!r}")
+    if not 0.0 <= _number("mean_weight", model.mean_weight) <= 1.0:
+        raise ModelError(f"mean_weight must be in [0, 1]: {model.mean_weight!r}")
+    if not _number("cutoff_rho", model.cutoff_rho) >= 0.0:
+        raise ModelError(f"cutoff_rho must not be negative: {model.cutoff_rho!r}")
+
+
+def _number(name: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ModelError(f"{name} must be a number: {value!r}")
+    return float(value)
