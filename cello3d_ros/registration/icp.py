@@ -1,0 +1,344 @@
+"""ICP of the paper's Table I: k nearest neighbours, one trim quantile, point-to-plane.
+
+The rules are those of libpointmatcher, so that results can be compared number by number:
+
+1. work in the frame of the reference, moved to the mean of its points;
+2. associate each reading point with its k nearest reference points, exactly;
+3. keep the associations whose squared distance is at most that of rank ``int(k N trim_ratio)``
+   over all of them together; each kept one is an equation of weight 1;
+4. point_to_plane: solve the 6x6 normal equations, take the rotation by angle and axis and the
+   translation as it is; point_to_point: the rigid motion of least squares (Umeyama 1991);
+   the step multiplies on the left;
+5. stop when the mean rotation and the mean translation of the last steps are both below their
+   limits, or after ``max_iterations``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from cello3d_ros.clouds.filters import subsample
+from cello3d_ros.clouds.neighbors import Indices, KdTree, build_tree, nearest_one
+from cello3d_ros.clouds.shape import Cloud
+from cello3d_ros.config import IcpConfig
+from cello3d_ros.geometry.se3 import Array
+
+REASONS = ("", "max_iterations", "singular", "too_few_points")
+_CONVERGED, _MAX_ITERATIONS, _SINGULAR, _TOO_FEW_POINTS = range(4)
+
+
+class Registration(NamedTuple):
+    """What one run of ICP found.
+
+    T_ref_read: (4, 4), p_ref = T_ref_read p_read; n_iterations: steps taken; converged: whether
+    the steps became small; reason: why not ("" or one of ``REASONS``); residual_rms_m: root mean
+    square of the kept associations' errors at the last step; n_associations: how many were kept.
+    """
+
+    T_ref_read: Array
+    n_iterations: int
+    converged: bool
+    reason: str
+    residual_rms_m: float
+    n_associations: int
+
+
+def icp(
+    reading: Array, reference: Array, normals: Array, T_init: Array, config: IcpConfig
+) -> Registration:
+    """Register all the given points.
+
+    reading: (M, 3); reference, normals: (N, 3); T_init: (4, 4), the first guess of T_ref_read.
+    Never raises on geometry: a registration without an answer keeps the last pose it had and
+    says why.
+    """
+    k = config.n_neighbors
+    if len(reading) == 0 or len(reference) < k:
+        return Registration(T_init.copy(), 0, False, REASONS[_TOO_FEW_POINTS], math.nan, 0)
+    mean = reference.mean(axis=0)
+    tree = build_tree(reference - mean)
+    T = T_init.copy()
+    T[:3, 3] -= mean
+    status, n_iterations, rms, n_kept = _icp(
+        np.ascontiguousarray(reading),
+        tree,
+        np.ascontiguousarray(normals[tree.order]),
+        T,
+        k,
+        config.trim_ratio,
+        config.error_metric == "point_to_plane",
+        config.max_iterations,
+        config.n_smoothed,
+        config.rotation_epsilon_rad,
+        config.translation_epsilon_m,
+    )
+    T[:3, 3] += mean
+    return Registration(T, n_iterations, status == _CONVERGED, REASONS[status], rms, n_kept)
+
+
+def register(
+    reading: Cloud,
+    reference: Cloud,
+    T_init: Array,
+    config: IcpConfig,
+    rng: np.random.Generator,
+) -> Registration:
+    """Register random subsamples of two clouds, drawn anew: they are part of ICP's noise."""
+    read = subsample(len(reading.points), config.n_reading_points, rng)
+    ref = subsample(len(reference.points), config.n_reference_points, rng)
+    return icp(
+        reading.points[read], reference.points[ref], reference.normals[ref], T_init, config
+    )
+
+
+def register_many(
+    reading: Cloud,
+    reference: Cloud,
+    T_inits: Array,
+    seeds: Sequence[Sequence[int]],
+    config: IcpConfig,
+    n_threads: int = 1,
+) -> list[Registration]:
+    """Register from many starts, each with subsamples of its own.
+
+    T_inits: (n, 4, 4); seeds: n seeds of numpy's default generator.  Each result depends on its
+    own start and seed only, hence not on the number of threads.
+    """
+
+    def one(i: int) -> Registration:
+        rng = np.random.default_rng(seeds[i])
+        return register(reading, reference, T_inits[i], config, rng)
+
+    if n_threads <= 1:
+        return [one(i) for i in range(len(T_inits))]
+    with ThreadPoolExecutor(n_threads) as pool:
+        return list(pool.map(one, range(len(T_inits))))
+
+
+@njit(cache=True, nogil=True)
+def _icp(
+    reading: Array,
+    tree: KdTree,
+    normals: Array,
+    T: Array,
+    k: int,
+    trim_ratio: float,
+    to_plane: bool,
+    max_iterations: int,
+    n_smoothed: int,
+    rotation_epsilon: float,
+    translation_epsilon: float,
+) -> tuple[int, int, float, int]:
+    """Run ICP and move T in place; return status, iterations, residual RMS and kept count."""
+    n = len(reading)
+    R_start, t_start = T[:3, :3].copy(), T[:3, 3].copy()
+    start = reading @ R_start.T + t_start  # steps are measured on the reading as it starts
+    R, t = np.eye(3), np.zeros(3)
+    distances2 = np.empty((n, k))
+    indices = np.full((n, k), -1)
+    rotation_steps = np.zeros(max_iterations)
+    translation_steps = np.zeros(max_iterations)
+    rms, n_kept = np.nan, 0
+    for iteration in range(max_iterations):
+        moved = start @ R.T + t
+        _associate(moved, tree, distances2, indices)
+        limit = _trim_limit(distances2, trim_ratio)
+        if to_plane:
+            ok, dR, dt, rms, n_kept = _plane_step(
+                moved, tree.points, normals, distances2, indices, limit
+            )
+        else:
+            ok, dR, dt, rms, n_kept = _point_step(moved, tree.points, distances2, indices, limit)
+        if not ok:
+            return _SINGULAR, iteration, rms, n_kept
+        t_new = dR @ t + dt
+        rotation_steps[iteration] = _angle(dR)
+        translation_steps[iteration] = np.linalg.norm(t_new - t)
+        R, t = dR @ R, t_new
+        T[:3, :3] = R @ R_start
+        T[:3, 3] = R @ t_start + t
+        if iteration + 1 >= n_smoothed:
+            last = slice(iteration + 1 - n_smoothed, iteration + 1)
+            if (
+                rotation_steps[last].mean() < rotation_epsilon
+                and translation_steps[last].mean() < translation_epsilon
+            ):
+                return _CONVERGED, iteration + 1, rms, n_kept
+    return _MAX_ITERATIONS, max_iterations, rms, n_kept
+
+
+@njit(cache=True, nogil=True)
+def _associate(moved: Array, tree: KdTree, distances2: Array, indices: Indices) -> None:
+    """Fill the k nearest neighbours of each point.
+
+    The neighbours of the step before are as good a set of k points as any: the k-th neighbour
+    cannot be farther than the farthest of them is now, so the search starts from that bound.
+    """
+    k = indices.shape[1]
+    stack = np.empty((64, 2))
+    points = tree.points
+    for i in range(len(moved)):
+        x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
+        bound2 = np.inf
+        if indices[i, 0] >= 0:
+            bound2 = 0.0
+            for j in range(k):
+                p = indices[i, j]
+                dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+                bound2 = max(bound2, dx * dx + dy * dy + dz * dz)
+            bound2 = np.nextafter(bound2, np.inf)
+        nearest_one(tree, x, y, z, bound2, distances2[i], indices[i], stack)
+
+
+@njit(cache=True, nogil=True)
+def _trim_limit(distances2: Array, ratio: float) -> float:
+    """Return the squared distance of rank ``int(size * ratio)``, the last for a ratio of 1."""
+    flat = distances2.ravel()
+    rank = min(int(len(flat) * ratio), len(flat) - 1)
+    return float(np.partition(flat, rank)[rank])
+
+
+@njit(cache=True, nogil=True)
+def _plane_step(
+    moved: Array,
+    points: Array,
+    normals: Array,
+    distances2: Array,
+    indices: Indices,
+    limit: float,
+) -> tuple[bool, Array, Array, float, int]:
+    """Solve the point-to-plane normal equations: ok, rotation, translation, RMS, count."""
+    A = np.zeros((6, 6))
+    b = np.zeros(6)
+    row = np.empty(6)
+    sum2 = 0.0
+    n_kept = 0
+    for i in range(len(moved)):
+        x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
+        for j in range(indices.shape[1]):
+            if not distances2[i, j] <= limit:
+                break
+            p = indices[i, j]
+            nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
+            row[0] = y * nz - z * ny
+            row[1] = z * nx - x * nz
+            row[2] = x * ny - y * nx
+            row[3], row[4], row[5] = nx, ny, nz
+            r = (x - points[p, 0]) * nx + (y - points[p, 1]) * ny + (z - points[p, 2]) * nz
+            sum2 += r * r
+            n_kept += 1
+            for u in range(6):
+                b[u] -= row[u] * r
+                for v in range(u + 1):
+                    A[u, v] += row[u] * row[v]
+    rms = math.sqrt(sum2 / max(n_kept, 1))
+    ok = _solve(A, b)
+    return ok, _rotation(b[:3]), b[3:], rms, n_kept
+
+
+@njit(cache=True, nogil=True)
+def _point_step(
+    moved: Array, points: Array, distances2: Array, indices: Indices, limit: float
+) -> tuple[bool, Array, Array, float, int]:
+    """Return the rigid motion that best moves the kept points onto theirs (Umeyama 1991)."""
+    from_mean, to_mean = np.zeros(3), np.zeros(3)
+    n_kept = 0
+    for i in range(len(moved)):
+        for j in range(indices.shape[1]):
+            if distances2[i, j] <= limit:
+                from_mean += moved[i]
+                to_mean += points[indices[i, j]]
+                n_kept += 1
+    from_mean /= max(n_kept, 1)
+    to_mean /= max(n_kept, 1)
+    H = np.zeros((3, 3))
+    sum2 = 0.0
+    for i in range(len(moved)):
+        for j in range(indices.shape[1]):
+            if distances2[i, j] <= limit:
+                a = moved[i] - from_mean
+                b = points[indices[i, j]] - to_mean
+                sum2 += distances2[i, j]
+                for u in range(3):
+                    for v in range(3):
+                        H[u, v] += a[u] * b[v]
+    U, s, Vt = np.linalg.svd(H)
+    R = Vt.T @ U.T
+    if np.linalg.det(R) < 0.0:
+        Vt[2] *= -1.0
+        R = Vt.T @ U.T
+    rms = math.sqrt(sum2 / max(n_kept, 1))
+    ok = s[1] > 1e-12 * s[0]  # points on one line leave the turn about it free
+    return ok, R, to_mean - R @ from_mean, rms, n_kept
+
+
+@njit(cache=True, nogil=True)
+def _solve(A: Array, b: Array) -> bool:
+    """Solve A x = b in place by Cholesky from the lower triangle; False when singular.
+
+    A is scaled to a unit diagonal first, so that the test of the pivots has no units.
+    """
+    n = len(b)
+    scale = np.empty(n)
+    for u in range(n):
+        if not (A[u, u] > 0.0 and np.isfinite(A[u, u])):
+            return False
+        scale[u] = 1.0 / math.sqrt(A[u, u])
+    for u in range(n):
+        for v in range(u + 1):
+            A[u, v] *= scale[u] * scale[v]
+    for u in range(n):
+        for v in range(u + 1):
+            total = A[u, v]
+            for w in range(v):
+                total -= A[u, w] * A[v, w]
+            if u != v:
+                A[u, v] = total / A[v, v]
+            elif total > 1e-12:
+                A[u, u] = math.sqrt(total)
+            else:
+                return False
+    for u in range(n):
+        b[u] *= scale[u]
+        for w in range(u):
+            b[u] -= A[u, w] * b[w]
+        b[u] /= A[u, u]
+    for u in range(n - 1, -1, -1):
+        for w in range(u + 1, n):
+            b[u] -= A[w, u] * b[w]
+        b[u] /= A[u, u]
+    b *= scale
+    return bool(np.isfinite(b).all())
+
+
+@njit(cache=True, nogil=True)
+def _rotation(omega: Array) -> Array:
+    """Return the rotation by the angle |omega| about the axis omega."""
+    angle = math.sqrt(omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2)
+    K = np.array(
+        [
+            [0.0, -omega[2], omega[1]],
+            [omega[2], 0.0, -omega[0]],
+            [-omega[1], omega[0], 0.0],
+        ]
+    )
+    if angle < 1e-150:
+        return np.eye(3)
+    s = math.sin(angle) / angle
+    c = 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+    return np.eye(3) + s * K + c * (K @ K)
+
+
+@njit(cache=True, nogil=True)
+def _angle(R: Array) -> float:
+    """Return the angle of a rotation, accurate near zero."""
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    return math.atan2(math.sqrt(x * x + y * y + z * z), R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+
+
