@@ -22,10 +22,6 @@ from cello3d_ros.errors import ModelError
 
 MAX_BYTES = 2 * 1024**3  # all items of one file, uncompressed
 
-_READERS: Mapping[tuple[int, int], Any] = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
 _DAMAGE = (  # what zipfile, zlib and numpy's header parser raise on nonsense
     *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError),
     *(ValueError, TypeError, LookupError, OverflowError, SyntaxError, tokenize.TokenError),
@@ -112,9 +108,13 @@ def _item(
     where = f"{path}: item {entry.filename[:-4]!r}"
     try:
         with archive.open(entry) as stream:
-            shape, fortran, found = _READERS[np.lib.format.read_magic(stream)](stream)
-            _check(where, shape, fortran, found, dtype, entry.file_size - stream.tell())
-            return np.frombuffer(stream.read(), dtype).reshape(shape)
+            if (version := np.lib.format.read_magic(stream)) != (1, 0):
+                raise ModelError(f"{where} is in .npy format {version}, not (1, 0)")
+            shape, fortran, found = np.lib.format.read_array_header_1_0(stream)
+            n_bytes = entry.file_size - stream.tell()
+            _check(where, shape, fortran, found, dtype, n_bytes)
+            # read() without a count would inflate whatever the stream holds
+            return np.frombuffer(stream.read(n_bytes), dtype).reshape(shape)
     except _DAMAGE as error:
         raise ModelError(f"{where} is damaged: {error}") from None
 

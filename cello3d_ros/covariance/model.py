@@ -114,7 +114,10 @@ class Prediction(NamedTuple):
 
 
 def project(descriptors: ArrayLike, theta: Array, mean: Array, scale: Array) -> Array:
-    """Return ``Theta (d - mean) / scale``; rho is a squared length there.  (..., D) -> (..., r)."""
+    """Return ``Theta (d - mean) / scale``, a point whose squared distances are rho.
+
+    descriptors: (..., D).  Returns (..., r).
+    """
     d = np.asarray(descriptors, dtype=np.float64)
     return np.asarray(((d - mean) / scale) @ theta.T)
 

@@ -1,0 +1,119 @@
+"""``cello3d info FILE``: what a file is, for a person or, with --json, for a machine."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cello3d_ros.config import PIPELINE, config_to
+from cello3d_ros.covariance.model import FORMAT_VERSION, Model, load_model
+from cello3d_ros.errors import Cello3dError
+
+
+class Kind(NamedTuple):
+    """One kind of file: which paths are of it, and what is known of one, as nested mappings."""
+
+    name: str
+    matches: Callable[[Path], bool]
+    describe: Callable[[Path], dict[str, Any]]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the verb."""
+    parser.add_argument("path", metavar="MODEL", type=Path, help="model file (.npz)")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Print the description of a file.  Raises Cello3dError if it is of no known kind."""
+    description = describe(arguments.path)
+    if arguments.json:
+        print(json.dumps(description, indent=2))
+    else:
+        print("\n".join(table(description)))
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Return what is known of a file, in the form that JSON prints; ``kind`` says what it is."""
+    if not path.exists():
+        raise Cello3dError(f"{path}: no such file")
+    for kind in KINDS:
+        if kind.matches(path):
+            return {"kind": kind.name, "path": str(path), **kind.describe(path)}
+    names = " or ".join(kind.name for kind in KINDS)
+    raise Cello3dError(f"{path} is not a {names}")
+
+
+def table(description: dict[str, Any]) -> Iterator[str]:
+    """Yield lines: a heading for each nested mapping, names and values in two columns."""
+    plain = {key: value for key, value in description.items() if not _nested(value)}
+    yield from _rows(plain, "")
+    for heading, values in description.items():
+        if _nested(values):
+            yield ""
+            yield heading
+            yield from _rows(values, "  ")
+
+
+def _rows(values: dict[str, Any], indent: str) -> Iterator[str]:
+    width = max((len(key) for key in values if not _nested(values[key])), default=0)
+    for key, value in values.items():
+        if _nested(value):
+            yield f"{indent}{key}"
+            yield from _rows(value, indent + "  ")
+        else:
+            yield f"{indent}{key.replace('_', ' '):{width}}  {_text(value)}".rstrip()
+
+
+def _nested(value: object) -> bool:
+    return isinstance(value, dict) and bool(value)
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return ", ".join(_text(item) for item in value)
+    return json.dumps(value) if isinstance(value, (bool, dict)) else str(value)
+
+
+def _describe_model(path: Path) -> dict[str, Any]:
+    model = load_model(path)
+    config = config_to(model.pipeline)
+    return {
+        "format_version": FORMAT_VERSION,
+        "size_bytes": path.stat().st_size,
+        "n_examples": model.n_examples,
+        "n_features": model.n_features,
+        "rank": len(model.theta),
+        "relative_to": model.shape,
+        "mean_weight": model.mean_weight,
+        "cutoff_rho": model.cutoff_rho if np.isfinite(model.cutoff_rho) else None,
+        "prior_variance": model.sampling.variance,
+        **_mean_sigmas(model),
+        "provenance": model.provenance,
+        "pipeline": {name: config[name] for name in PIPELINE},
+        "sampling": _settings(model.sampling),
+    }
+
+
+def _mean_sigmas(model: Model) -> dict[str, Any]:
+    """Return standard deviations of the mean covariance, in the units they have."""
+    sigmas = [float(value) for value in np.sqrt(np.diag(model.mean_covariance))]
+    if model.shape != "none":
+        return {"mean_sigmas_relative": sigmas}
+    return {"mean_sigmas_m": sigmas[:3], "mean_sigmas_rad": sigmas[3:]}
+
+
+def _settings(section: Any) -> dict[str, Any]:
+    return {key: list(v) if isinstance(v, tuple) else v for key, v in vars(section).items()}
+
+
+KINDS = (Kind("model file (.npz)", lambda path: path.suffix == ".npz", _describe_model),)
