@@ -11,25 +11,22 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
-import io
 import json
 import os
 import platform
-import struct
-import zipfile
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.config import Pipeline, SamplingConfig, config_from, config_to, pipeline_of
-from cello3d_ros.errors import ConfigError, DatasetError
-
-Array = NDArray[np.float64]
+from cello3d_ros.covariance.archive import read_arrays, write_arrays
+from cello3d_ros.errors import ConfigError, DatasetError, ModelError
+from cello3d_ros.geometry.gaussian import is_positive_definite
+from cello3d_ros.geometry.se3 import Array
 
 FORMAT = 1
 CONVENTIONS = (
@@ -37,18 +34,16 @@ CONVENTIONS = (
     "log(inverse(T_mean) T_hat); covariances about ground truth, on the reading side"
 )
 _PACKAGES = ("cello3d_ros", "numpy", "scipy", "numba", "scikit-learn")
-_DAMAGE = (  # what reading a damaged file raises
-    *(OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError),
-    *(struct.error, zlib.error, zipfile.BadZipFile),
-)
-_DTYPES = {
-    "T_mean": np.float64,
-    "xi": np.float64,
-    "kept": np.bool_,
-    "covariance": np.float64,
-    "descriptors": np.float32,
-    "rotations_rad": np.float64,
+_ARRAYS = {
+    "T_mean": "<f8",
+    "xi": "<f8",
+    "kept": "|b1",
+    "covariance": "<f8",
+    "descriptors": "<f4",
+    "rotations_rad": "<f8",
 }
+_HEADER = ("recording", "i", "j", "accepted", "reason", "n_converged", "n_failed", "overlap_ratio")
+_ITEMS = {"header": "|u1", "shapes": "<f8", **_ARRAYS}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,11 +77,6 @@ class PairRecord:
     def key(self) -> tuple[str, int, int]:
         """Name of the pair: recording, reference, reading."""
         return self.recording, self.i, self.j
-
-
-_FIELDS = tuple(
-    setting.name for setting in dataclasses.fields(PairRecord) if setting.name != "shapes"
-)
 
 
 class Dataset:
@@ -142,12 +132,12 @@ class Dataset:
     def read(self, recording: str, i: int, j: int) -> PairRecord:
         """Return one record.  Raises DatasetError if it is missing or damaged."""
         path = self._file(recording, i, j)
+        if not path.is_file():
+            raise DatasetError(f"{self.path} has no pair {recording} {i} {j}")
         try:
-            record = _unpacked(_read_arrays(path))
+            record = _unpacked(dict(read_arrays(path, _ITEMS)))
             _check(record)
-        except FileNotFoundError:
-            raise DatasetError(f"{self.path} has no pair {recording} {i} {j}") from None
-        except _DAMAGE as error:
+        except (ModelError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise DatasetError(f"{path} is damaged, sample it again: {error}") from None
         if record.key != (recording, i, j):
             raise DatasetError(f"{path} holds another pair: {record.key}")
@@ -156,13 +146,14 @@ class Dataset:
     def write(self, record: PairRecord) -> None:
         """Store one record, in place of an older one.  Raises DatasetError on unfit values."""
         path = self._file(*record.key)
+        path.parent.mkdir(exist_ok=True)
         try:
             _check(record)
-        except ValueError as error:
+            write_arrays(path, _packed(record))
+        except ModelError as error:
+            raise DatasetError(str(error)) from None
+        except (ValueError, TypeError) as error:
             raise DatasetError(f"refused to write {path}: {error}") from None
-        path.parent.mkdir(exist_ok=True)
-        arrays: Any = _packed(record)
-        _write_whole(path, lambda stream: np.savez_compressed(stream, **arrays))
 
     def __iter__(self) -> Iterator[PairRecord]:
         for key in self.keys():
@@ -248,83 +239,58 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 def _write_manifest(path: Path, manifest: dict[str, Any]) -> None:
     text = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
-    _write_whole(path / "manifest.json", lambda stream: stream.write(text.encode()))
-
-
-def _write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file that is either there and complete, or not there."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    partial = path / f".manifest.json.{os.getpid()}.tmp"
     try:
-        with open(partial, "wb") as stream:
-            write(stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(partial, path)
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, path / "manifest.json")
     except OSError as error:
-        raise DatasetError(f"cannot write {path}: {error.strerror or error}") from error
+        raise DatasetError(f"cannot write {path / 'manifest.json'}: {error.strerror}") from None
     finally:
         partial.unlink(missing_ok=True)
 
 
-def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Read a pair file, every checksum first: numpy would parse what is damaged."""
-    blob = path.read_bytes()
-    with zipfile.ZipFile(io.BytesIO(blob)) as archive:
-        if damaged := archive.testzip():
-            raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
-    with np.load(io.BytesIO(blob), allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
-
-
 def _packed(record: PairRecord) -> dict[str, NDArray[Any]]:
-    arrays: dict[str, NDArray[Any]] = {
-        name: np.asarray(getattr(record, name), _DTYPES.get(name)) for name in _FIELDS
+    """Return the arrays of a record and its other fields as JSON."""
+    header = {name: getattr(record, name) for name in _HEADER}
+    header["shapes"] = sorted(record.shapes)
+    text = json.dumps(header, allow_nan=False, default=np.generic.item).encode()
+    shapes = [record.shapes[name] for name in header["shapes"]]
+    return {
+        "header": np.frombuffer(text, np.uint8),
+        "shapes": np.array(shapes, np.float64).reshape(-1, 6, 6),
+        **{
+            name: np.array(getattr(record, name), dtype, order="C")
+            for name, dtype in _ARRAYS.items()
+        },
     }
-    names = sorted(record.shapes)
-    arrays["shape_names"] = np.asarray(names, np.str_)
-    arrays["shapes"] = np.array([record.shapes[name] for name in names]).reshape(-1, 6, 6)
-    return arrays
 
 
-def _unpacked(arrays: dict[str, NDArray[Any]]) -> PairRecord:
-    values: dict[str, Any] = {
-        name: arrays[name] if name in _DTYPES else arrays[name].item() for name in _FIELDS
-    }
-    shapes = zip(arrays["shape_names"].tolist(), arrays["shapes"], strict=True)
-    return PairRecord(**values, shapes=dict(shapes))
+def _unpacked(arrays: dict[str, Any]) -> PairRecord:
+    header = json.loads(arrays.pop("header").tobytes())
+    shapes = dict(zip(header.pop("shapes"), arrays.pop("shapes"), strict=True))
+    return PairRecord(**header, **arrays, shapes=shapes)
 
 
 def _check(record: PairRecord) -> None:
     """Raise ValueError unless the record may stand in a dataset."""
-    arrays = _packed(record)
-    for name, value in arrays.items():
-        if value.dtype.kind == "f" and not np.isfinite(value).all():
+    for name in _ARRAYS:
+        if not np.isfinite(getattr(record, name)).all():
             raise ValueError(f"{name} is not finite")
     n_samples = len(record.xi)
-    if arrays["xi"].shape != (n_samples, 6) or arrays["kept"].shape != (n_samples,):
-        raise ValueError(f"xi {arrays['xi'].shape} and kept {arrays['kept'].shape} disagree")
-    if arrays["T_mean"].shape != (4, 4):
-        raise ValueError(f"T_mean has shape {arrays['T_mean'].shape}, not (4, 4)")
+    if record.xi.shape != (n_samples, 6) or record.kept.shape != (n_samples,):
+        raise ValueError(f"xi {record.xi.shape} and kept {record.kept.shape} disagree")
+    if record.T_mean.shape != (4, 4):
+        raise ValueError(f"T_mean has shape {record.T_mean.shape}, not (4, 4)")
     if not record.accepted:
         if not record.reason:
             raise ValueError("a rejected pair needs a reason")
         return
-    shape, n_rotations = arrays["descriptors"].shape, len(record.rotations_rad)
+    shape, n_rotations = record.descriptors.shape, len(record.rotations_rad)
     if n_rotations == 0 or len(shape) != 2 or shape[0] != n_rotations or shape[1] == 0:
         raise ValueError(f"{n_rotations} rotations, descriptors {shape}")
     for name, Y in {"covariance": record.covariance, **record.shapes}.items():
-        _check_covariance(name, Y)
-
-
-def _check_covariance(name: str, Y: Array) -> None:
-    if Y.shape != (6, 6):
-        raise ValueError(f"{name} has shape {Y.shape}, not (6, 6)")
-    if np.abs(Y - Y.T).max() > 1e-9 * np.abs(Y).max():
-        raise ValueError(f"{name} is not symmetric")
-    try:
-        np.linalg.cholesky(Y)
-    except np.linalg.LinAlgError:
-        raise ValueError(f"{name} is not positive definite") from None
+        if Y.shape != (6, 6) or not is_positive_definite(Y):
+            raise ValueError(f"{name} is not a positive definite 6x6 matrix")
 
 
 def _check_name(recording: str) -> None:

@@ -67,6 +67,12 @@ def test_what_is_written_is_read_to_the_bit(dataset: Dataset, record: PairRecord
     assert dataset.has(*record.key)
 
 
+def test_counts_may_be_numpy_numbers(dataset: Dataset) -> None:
+    counts = {"i": np.int64(0), "n_failed": np.sum([True]), "overlap_ratio": np.float32(0.5)}
+    dataset.write(dataclasses.replace(accepted(), **counts, accepted=np.True_))  # type: ignore[arg-type]
+    assert_same(dataset.read("hall", 0, 1), dataclasses.replace(accepted(), overlap_ratio=0.5))
+
+
 def test_iteration_is_ordered_by_recording_i_j_as_numbers(dataset: Dataset) -> None:
     for name, i, j in [("b_2", 2, 3), ("b_2", 10, 11), ("a", 1, 2), ("a", 0, 2), ("b_2", 2, 11)]:
         dataset.write(accepted(name, i, j))
@@ -156,10 +162,16 @@ def test_a_pair_file_under_the_name_of_another_is_damage(dataset: Dataset) -> No
     [
         ({"covariance": np.full((6, 6), np.nan)}, "covariance is not finite"),
         ({"xi": np.full((30, 6), np.inf)}, "xi is not finite"),
-        ({"covariance": np.diag([1.0, 1, 1, 1, 1, 0])}, "covariance is not positive definite"),
-        ({"covariance": np.eye(6) + np.eye(6, k=1) * 0.1}, "covariance is not symmetric"),
-        ({"shapes": {"hessian": -np.eye(6)}}, "hessian is not positive definite"),
+        ({"covariance": np.diag([1.0, 1, 1, 1, 1, 0])}, "covariance is not a positive definite"),
+        (
+            {"covariance": np.eye(6) + np.eye(6, k=1) * 0.1},
+            "covariance is not a positive definite",
+        ),
+        ({"shapes": {"hessian": -np.eye(6)}}, "hessian is not a positive definite"),
         ({"descriptors": np.zeros((3, 704), np.float32)}, "4 rotations"),
+        ({"shapes": {"hessian": np.eye(3)}}, "hessian is not a positive definite"),
+        ({"shapes": {"hessian": np.full((6, 6), np.nan)}}, "hessian is not a positive definite"),
+        ({"overlap_ratio": float("nan")}, "refused to write"),
         ({"kept": np.ones(3, np.bool_)}, "disagree"),
         ({"T_mean": np.eye(3)}, "T_mean has shape"),
         ({"accepted": False}, "needs a reason"),
