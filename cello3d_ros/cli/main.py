@@ -1,0 +1,59 @@
+"""``cello3d``: one verb a module; known errors become one line and exit status 1."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from cello3d_ros import __version__
+from cello3d_ros.errors import Cello3dError
+
+VERBS = {
+    "estimate": "register one pair of files and predict its covariance",
+    "info": "say what a model holds",
+    "simulate": "scan a simulated world into a rosbag2",
+    "sample": "sample ICP on every pair of recordings into a dataset",
+    "train": "learn a model from datasets",
+    "demo": "replay a bag through the node and judge its answers",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb.  Returns 0, 1 for a known error, 2 for usage, 130 for Ctrl-C."""
+    argv = sys.argv[1:] if argv is None else argv
+    try:
+        arguments = _parse(argv)
+        return int(arguments.run(arguments) or 0)
+    except Cello3dError as error:
+        print(f"cello3d: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("cello3d: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of our output left, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    """Parse the arguments; only the chosen verb's module is imported."""
+    parser = argparse.ArgumentParser(
+        prog="cello3d", description="The covariance of ICP: sample, learn, predict."
+    )
+    parser.add_argument("--version", action="version", version=f"cello3d {__version__}")
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    chosen = next((word for word in argv if not word.startswith("-")), None)
+    for verb, summary in VERBS.items():
+        subparser = verbs.add_parser(verb, help=summary, description=summary)
+        if verb == chosen:
+            module = importlib.import_module(f"cello3d_ros.cli.{verb}")
+            module.add_arguments(subparser)
+            subparser.set_defaults(run=module.run)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,54 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = "cello3d_ros"
+
+ROS = ["ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"]
+OPEN3D = ["open3d-cpu>=0.19; platform_machine == 'x86_64'", "open3d>=0.19; platform_machine != 'x86_64'"]
+TEST = ["pytest"]
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="The covariance of ICP registrations, sampled, learned and predicted (CELLO-3D)",
+    author="cello3d_ros maintainers",
+    maintainer="cello3d_ros maintainers",
+    maintainer_email="maintainers@cello3d.org",
+    license="BSD-3-Clause",
+    python_requires=">=3.11",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["models/*.npz", "py.typed"]},
+    zip_safe=False,
+    install_requires=[
+        "setuptools",
+        "numpy>=1.26,<2.5",
+        "scipy>=1.11",
+        "numba>=0.59",
+        "scikit-learn>=1.3",
+        "PyYAML>=6",
+        "tqdm>=4.60",
+        "matplotlib>=3.6",
+        "rosbags>=0.11,<0.12",
+    ],
+    extras_require={
+        "ros": ROS,
+        "open3d": OPEN3D,
+        "cluster": ["distributed>=2024.1"],
+        "test": TEST,
+        "dev": [*TEST, "ruff", "mypy", "import-linter", "types-PyYAML", "types-tqdm", "scipy-stubs"],
+    },
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/config", glob("config/*")),
+        (f"share/{NAME}/launch", glob("launch/*.launch.py")),
+        (f"share/{NAME}/rviz", glob("rviz/*.rviz")),
+    ],
+    entry_points={
+        "console_scripts": [
+            "covariance_node = cello3d_ros.ros.node:main",
+            "cello3d = cello3d_ros.cli.main:main",
+        ]
+    },
+)
