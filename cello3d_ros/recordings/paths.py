@@ -1,0 +1,104 @@
+"""The way of a scanner through a world: a smooth curve, and poses along it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from cello3d_ros.geometry.se3 import Array
+
+_MAX_TURN_RAD = np.radians(12.0)  # a step; the sway adds about 2
+_SWAY_STD = np.array([np.radians(1.5), np.radians(1.5), np.radians(2.0), 0.03])  # r, p, y, height
+_SWAY_MEMORY = 0.8
+
+
+@dataclass(frozen=True)
+class Route:
+    """A curve on the floor.
+
+    points: (M, 3), dense.  A closed route is walked round and round, an open one to and fro
+    (backwards on the way back).
+    """
+
+    points: Array
+    closed: bool
+
+    def distance(self, xy: ArrayLike) -> Array:
+        """Return the horizontal distance (...) of points (..., 2) from the curve."""
+        return self.nearest(xy)[0]
+
+    def nearest(self, xy: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
+        """Return that distance, and the index of the nearest point of the curve."""
+        distance, index = cKDTree(self.points[:, :2]).query(np.asarray(xy, dtype=np.float64))
+        return np.asarray(distance), np.asarray(index)
+
+
+def smooth(corners: ArrayLike, closed: bool, spacing_m: float = 0.05) -> Route:
+    """Return the curve that cuts the corners (W, 3) of a polygon (Chaikin 1974).
+
+    It stays in the hull of each three successive corners: straight on where they are in line.
+    """
+    points = np.asarray(corners, dtype=np.float64)
+    for _ in range(5):
+        following = np.roll(points, -1, axis=0)
+        quarter = 0.25 * (following - points)
+        cut = np.stack([points + quarter, following - quarter], axis=1).reshape(-1, 3)
+        points = cut if closed else np.concatenate([points[:1], cut[1:-3], points[-1:]])
+    if closed:
+        points = np.concatenate([points, points[:1]])
+    s = _arc_length(points)
+    even = np.linspace(0.0, s[-1], max(2, int(s[-1] / spacing_m)))
+    return Route(np.stack([np.interp(even, s, c) for c in points.T], axis=1), closed)
+
+
+def walk(route: Route, n_scans: int, height_m: float, rng: np.random.Generator) -> Array:
+    """Return sensor poses T_world_sensor (n_scans, 4, 4) along the route.
+
+    Steps of 0.4 to 0.9 m, of at least 0.3 m where the curve turns.  The sensor looks along the
+    curve, turning by at most 12 degrees a step, and sways in roll, pitch, yaw and height.  A
+    longer walk starts like a shorter one of the same generator.
+    """
+    step_rng, sway_rng = rng.spawn(2)
+    s = _arc_length(route.points)
+    at, yaw = _steps(route, s, n_scans, step_rng)
+    place = np.stack([np.interp(at, s, c) for c in route.points.T], axis=1)
+    sway = _sway(n_scans, sway_rng)
+    T = np.tile(np.eye(4), (n_scans, 1, 1))
+    angles = np.stack([yaw + sway[:, 2], sway[:, 1], sway[:, 0]], axis=1)
+    T[:, :3, :3] = Rotation.from_euler("ZYX", angles).as_matrix()
+    T[:, :3, 3] = place
+    T[:, 2, 3] += height_m + sway[:, 3]
+    return T
+
+
+def _steps(route: Route, s: Array, n_scans: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return the arc length and the yaw of each scan; ``s`` is the arc length of the points."""
+    forward = np.diff(route.points, axis=0)
+    heading = np.arctan2(forward[:, 1], forward[:, 0])
+    length = s[-1]
+    walked, at, yaw = 0.0, [0.0], [heading[0]]
+    for step in rng.uniform(0.4, 0.9, size=n_scans - 1):
+        here = heading[min(int(np.searchsorted(s, at[-1], side="right")), len(heading)) - 1]
+        turn = (here - yaw[-1] + np.pi) % (2 * np.pi) - np.pi
+        walked += max(0.3, 0.6 * step) if abs(turn) > _MAX_TURN_RAD else step
+        fro = length - abs(walked % (2 * length) - length)
+        at.append(walked % length if route.closed else fro)
+        yaw.append(yaw[-1] + np.clip(turn, -_MAX_TURN_RAD, _MAX_TURN_RAD))
+    return np.array(at), np.array(yaw)
+
+
+def _sway(n_scans: int, rng: np.random.Generator) -> Array:
+    """Return smooth noise (n_scans, 4): roll, pitch, yaw, height, of stationary deviation."""
+    fresh = rng.normal(size=(n_scans, 4)) * _SWAY_STD
+    out = fresh.copy()
+    for k in range(1, n_scans):
+        out[k] = _SWAY_MEMORY * out[k - 1] + np.sqrt(1 - _SWAY_MEMORY**2) * fresh[k]
+    return np.asarray(out)
+
+
+def _arc_length(points: Array) -> Array:
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])

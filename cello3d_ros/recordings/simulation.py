@@ -1,0 +1,72 @@
+"""Simulated recordings: a scanner carried through a world, with ground truth and odometry."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from cello3d_ros.errors import RecordingError
+from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.recordings.odometry import drift_odometry
+from cello3d_ros.recordings.paths import walk
+from cello3d_ros.recordings.recording import Scan
+from cello3d_ros.recordings.scanner import SCANNERS, Scanner, raycasting_scene, scan
+from cello3d_ros.recordings.worlds import World, build_world
+
+FIRST_STAMP_NS = 1_600_000_000_000_000_000
+STEP_NS = 500_000_000
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A recording that is computed while it is read; all of it follows from these four.
+
+    A scan depends on the seed and on its own number only: a longer simulation starts with the
+    scans of a shorter one.
+    """
+
+    world: str
+    seed: int
+    n_scans: int
+    scanner: Scanner = SCANNERS["spinning32"]
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise RecordingError(f"the seed of a simulation must not be negative: {self.seed}")
+        if self.n_scans < 1:
+            raise RecordingError(f"a simulation needs at least one scan, not {self.n_scans}")
+
+    @property
+    def name(self) -> str:
+        """World and seed."""
+        return f"{self.world}-{self.seed}"
+
+    def __len__(self) -> int:
+        return self.n_scans
+
+    def __iter__(self) -> Iterator[Scan]:
+        world, truth, odometry = self.build()
+        scene = raycasting_scene(world.mesh)
+        for k in range(self.n_scans):
+            yield Scan(
+                stamp_ns=FIRST_STAMP_NS + k * STEP_NS,
+                points=scan(scene, self.scanner, truth[k], np.random.default_rng([self.seed, k])),
+                T_world_sensor=truth[k],
+                T_odom_sensor=odometry[k],
+            )
+
+    def build(self) -> tuple[World, Array, Array]:
+        """Return the world, and T_world_sensor and T_odom_sensor, both (n_scans, 4, 4)."""
+        layout, way, drift = np.random.default_rng(self.seed).spawn(3)
+        world = build_world(self.world, layout)
+        truth = walk(world.route, self.n_scans, way.uniform(0.9, 1.5), way)
+        return world, truth, drift_odometry(truth, drift)
+
+
+def simulate(
+    world: str, seed: int, n_scans: int, scanner: Scanner = SCANNERS["spinning32"]
+) -> Iterator[Scan]:
+    """Yield the scans of a simulated world, 0.5 s apart; the same arguments give the same bits."""
+    return iter(Simulation(world, seed, n_scans, scanner))

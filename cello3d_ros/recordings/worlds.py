@@ -1,0 +1,45 @@
+"""Simulated worlds by name: a mesh built from a seed, and a route that runs clear of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from cello3d_ros.errors import RecordingError
+from cello3d_ros.recordings import indoor, outdoor
+from cello3d_ros.recordings.meshes import Mesh
+from cello3d_ros.recordings.paths import Route
+
+
+@dataclass(frozen=True)
+class World:
+    """What a simulated scanner sees, and where it is carried; z is up, metres."""
+
+    name: str
+    mesh: Mesh
+    route: Route
+
+
+Builder = Callable[[np.random.Generator], tuple[Mesh, Route]]
+
+WORLDS: MappingProxyType[str, Builder] = MappingProxyType(
+    {
+        "rooms": indoor.rooms,
+        "hall": indoor.hall,
+        "corridor": indoor.corridor,
+        "stairs": indoor.stairs,
+        "garden": outdoor.garden,
+        "wood": outdoor.wood,
+    }
+)
+
+
+def build_world(name: str, rng: np.random.Generator) -> World:
+    """Return the world of that name; layout and sizes are drawn from ``rng``."""
+    if name not in WORLDS:
+        raise RecordingError(f"there is no world {name!r}; known are {', '.join(WORLDS)}")
+    mesh, route = WORLDS[name](rng)
+    return World(name, mesh, route)
