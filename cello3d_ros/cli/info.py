@@ -67,7 +67,7 @@ def _rows(values: dict[str, Any], indent: str) -> Iterator[str]:
             yield f"{indent}{key}"
             yield from _rows(value, indent + "  ")
         else:
-            yield f"{indent}{key.replace('_', ' '):{width}}  {_text(value)}".rstrip()
+            yield f"{indent}{key:{width}}  {_text(value)}".rstrip()
 
 
 def _nested(value: object) -> bool:

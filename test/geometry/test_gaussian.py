@@ -1,0 +1,314 @@
+"""Gaussians on SE(3): checks 2 to 6 of the conventions, against closed forms and Monte Carlo."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cello3d_ros.geometry import gaussian as g
+from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.se3 import Array
+
+EYE = np.eye(6)
+
+# Barfoot & Furgale's two poses with large covariances
+T1 = se3.exp([0, 2, 0, np.pi / 6, 0, 0])
+T2 = se3.exp([0, 0, 1, 0, np.pi / 4, 0])
+S1 = np.diag([1, 0.5, 0.5, 0.05, 0.1, 0.05])
+S2 = np.diag([0.5, 1, 0.5, 0.05, 0.05, 0.1])
+LEFT = [1.88094, 1.41102, 1.33274, 0.10047, 0.16089, 0.13641]
+RIGHT = [1.34602, 1.55995, 1.28091, 0.10063, 0.14854, 0.14854]
+
+
+def covariances(n: int, rng: np.random.Generator, scale: float = 1.0) -> Array:
+    """Return random well-conditioned covariances.  (n, 6, 6)."""
+    A = rng.standard_normal((n, 6, 12))
+    return g.symmetrized(scale * A @ np.swapaxes(A, 1, 2) / 12)
+
+
+def poses(n: int, rng: np.random.Generator) -> Array:
+    """Return random poses.  (n, 4, 4)."""
+    return se3.exp(rng.standard_normal((n, 6)))
+
+
+# --- sampling and sides ---------------------------------------------------------------------
+
+
+def test_a_constant_offset_counts_as_spread_about_the_truth() -> None:
+    n, b = 40, np.arange(1.0, 7.0)
+    Y = g.sampled_covariance(np.tile(b, (n, 1)))
+    np.testing.assert_allclose(Y, np.outer(b, b) * n / (n - 1), rtol=1e-14)
+    np.testing.assert_array_equal(g.sampled_covariance(np.tile(b, (n, 1)), b), 0.0)
+
+
+def test_about_its_mean_the_sampled_covariance_is_numpys() -> None:
+    xi = np.random.default_rng(0).standard_normal((5, 30, 6)) + 3.0
+    Y = g.sampled_covariance(xi, xi.mean(axis=1))
+    expected = [np.cov(samples, rowvar=False) for samples in xi]
+    np.testing.assert_allclose(Y, expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("shape", [(6,), (0, 6), (1, 6)])
+def test_one_sample_has_no_covariance(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="two samples"):
+        g.sampled_covariance(np.zeros(shape))
+
+
+def test_changing_sides_and_back_is_the_identity() -> None:
+    rng = np.random.default_rng(1)
+    T, Y = poses(50, rng), covariances(50, rng)
+    back = g.to_right(T, g.to_left(T, Y))
+    np.testing.assert_allclose(back, Y, rtol=0, atol=1e-12 * np.abs(g.to_left(T, Y)).max())
+
+
+def test_left_covariance_is_that_of_the_perturbation_seen_from_the_left() -> None:
+    rng = np.random.default_rng(2)
+    xi = 1e-3 * rng.standard_normal((500, 6)) * [1, 2, 3, 4, 5, 6]
+    left = se3.log(T1 @ se3.exp(xi) @ se3.inverse(T1))
+    np.testing.assert_allclose(
+        g.to_left(T1, g.sampled_covariance(xi)), g.sampled_covariance(left), atol=1e-17
+    )
+
+
+# --- compounding ----------------------------------------------------------------------------
+
+
+def sampled_compound(side: str, n: int = 400_000) -> Array:
+    """Return the covariance of T1 T2 by Monte Carlo, ``E[xi xi^T]`` of the exact product.
+
+    The linear part of xi has a known covariance, so only the rest is left to chance.
+    """
+    rng = np.random.default_rng(3)
+    x1 = rng.standard_normal((n, 6)) * np.sqrt(np.diag(S1))
+    x2 = rng.standard_normal((n, 6)) * np.sqrt(np.diag(S2))
+    mean_inverse = se3.inverse(T1 @ T2)
+    if side == "left":
+        xi = se3.log(se3.exp(x1) @ T1 @ se3.exp(x2) @ T2 @ mean_inverse)
+        Ad = se3.adjoint(T1)
+        linear, known = x1 + x2 @ Ad.T, S1 + Ad @ S2 @ Ad.T
+    else:
+        xi = se3.log(mean_inverse @ T1 @ se3.exp(x1) @ T2 @ se3.exp(x2))
+        Ad = se3.adjoint(se3.inverse(T2))
+        linear, known = x1 @ Ad.T + x2, Ad @ S1 @ Ad.T + S2
+    return g.sampled_covariance(xi) - g.sampled_covariance(linear) + known
+
+
+def relative_error(Y: Array, truth: Array) -> float:
+    return float(np.linalg.norm(Y - truth) / np.linalg.norm(truth))
+
+
+@pytest.mark.parametrize(("side", "diagonal"), [("left", LEFT), ("right", RIGHT)])
+def test_fourth_order_compounding_gives_the_published_diagonal(
+    side: str, diagonal: list[float]
+) -> None:
+    compound = g.compound_left if side == "left" else g.compound_right
+    T, Y = compound(T1, S1, T2, S2)
+    np.testing.assert_allclose(np.diag(Y), diagonal, rtol=0, atol=6e-6)
+    np.testing.assert_array_equal(T, T1 @ T2)
+    np.testing.assert_array_equal(Y, Y.T)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_fourth_order_compounding_agrees_with_monte_carlo(side: str) -> None:
+    compound = g.compound_left if side == "left" else g.compound_right
+    truth = sampled_compound(side)
+    assert relative_error(compound(T1, S1, T2, S2, 4).Y, truth) <= 0.002
+    assert relative_error(compound(T1, S1, T2, S2, 2).Y, truth) == pytest.approx(0.0133, rel=0.15)
+
+
+def test_compounding_at_the_identity_gives_the_closed_form() -> None:
+    eye = np.eye(4)
+    Y = g.compound_left(eye, EYE, eye, np.diag([3.0, 1, 1, 1, 1, 5])).Y
+    np.testing.assert_allclose(Y, np.diag([4, 19 / 6, 17 / 6, 13 / 6, 13 / 6, 4.5]), atol=1e-14)
+
+
+def test_right_and_left_compounding_are_the_same_to_second_order() -> None:
+    rng = np.random.default_rng(4)
+    (A, B), (Ya, Yb) = poses(2, rng), covariances(2, rng, 1e-2)
+    right = g.compound_right(A, Ya, B, Yb, order=2).Y
+    left = g.compound_left(A, g.to_left(A, Ya), B, g.to_left(B, Yb), order=2).Y
+    np.testing.assert_allclose(g.to_left(A @ B, right), left, rtol=1e-10)
+
+
+def test_compounding_with_a_certain_pose_only_moves_the_covariance() -> None:
+    zero = np.zeros((6, 6))
+    np.testing.assert_allclose(g.compound_right(T1, S1, np.eye(4), zero).Y, S1, atol=1e-15)
+    np.testing.assert_allclose(g.compound_right(T1, zero, T2, S2).Y, S2, atol=1e-15)
+    np.testing.assert_allclose(g.compound_left(T1, zero, T2, S2).Y, g.to_left(T1, S2), atol=1e-15)
+
+
+def test_compounding_a_batch_equals_one_at_a_time_exactly_symmetric() -> None:
+    rng = np.random.default_rng(5)
+    A, B = poses(6, rng).reshape(2, 3, 4, 4), poses(3, rng)
+    Ya, Yb = covariances(6, rng, 0.05).reshape(2, 3, 6, 6), covariances(3, rng, 0.05)
+    T, Y = g.compound_right(A, Ya, B, Yb)
+    assert T.shape == (2, 3, 4, 4)
+    np.testing.assert_array_equal(Y, np.swapaxes(Y, -1, -2))
+    for i, j in np.ndindex(2, 3):
+        one = g.compound_right(A[i, j], Ya[i, j], B[j], Yb[j])
+        np.testing.assert_allclose(T[i, j], one.T, atol=1e-14)
+        np.testing.assert_allclose(Y[i, j], one.Y, rtol=1e-12, atol=1e-14)
+
+
+def test_compounding_knows_two_orders() -> None:
+    with pytest.raises(ValueError, match="order 2 or 4, not 3"):
+        g.compound_left(T1, S1, T2, S2, order=3)
+
+
+def test_a_chain_sampled_from_its_own_covariances_is_consistent() -> None:
+    rng = np.random.default_rng(6)
+    n_steps, n_runs = 35, 20_000
+    steps = se3.exp([0.4, 0.05, 0, 0, 0.01, 0.05] + 0.05 * rng.standard_normal((n_steps, 6)))
+    Ys = covariances(n_steps, rng) * np.outer(s := [0.01] * 3 + [0.004] * 3, s)
+    truth, Y = np.eye(4), np.zeros((6, 6))
+    runs = np.tile(np.eye(4), (n_runs, 1, 1))
+    for T_step, Y_step in zip(steps, Ys, strict=True):
+        truth, Y = g.compound_right(truth, Y, T_step, Y_step)
+        noise = rng.standard_normal((n_runs, 6)) @ np.linalg.cholesky(Y_step).T
+        runs = runs @ T_step @ se3.exp(noise)
+    xi = se3.log(se3.inverse(truth) @ runs)
+    joint = g.mahalanobis(xi, Y)
+    translation = g.mahalanobis(xi[:, :3], Y[:3, :3])
+    rotation = g.mahalanobis(xi[:, 3:], Y[3:, 3:])
+    assert joint.mean() == pytest.approx(2.350, abs=0.02)
+    assert translation.mean() == pytest.approx(1.596, abs=0.02)
+    assert rotation.mean() == pytest.approx(1.596, abs=0.02)
+    assert (translation <= joint + 1e-9).all() and (rotation <= joint + 1e-9).all()
+
+
+# --- divergence and distance ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("factor", "expected"),
+    [(1, 0.0), (2, 0.579442), (0.5, 0.920558), (10, 4.207755), (0.1, 20.092245)],
+)
+def test_kl_of_scaled_identities(factor: float, expected: float) -> None:
+    assert g.kl(EYE, factor * EYE) == pytest.approx(expected, abs=6e-7)
+
+
+def test_kl_is_zero_only_between_equals_and_never_negative() -> None:
+    Y = covariances(200, np.random.default_rng(8))
+    np.testing.assert_array_equal(g.kl(Y, Y), 0.0)
+    nearly = g.kl(Y, Y * (1 + 1e-9))
+    assert (nearly >= 0).all() and (nearly < 1e-14).all()
+    assert (g.kl(Y[1:], Y[:-1]) > 0).all()
+
+
+def test_kl_is_the_textbook_formula() -> None:
+    Y, F = covariances(60, np.random.default_rng(9)).reshape(2, 30, 6, 6)
+    trace = np.trace(np.linalg.solve(F, Y), axis1=1, axis2=2)
+    expected = 0.5 * (trace - 6 + np.linalg.slogdet(F)[1] - np.linalg.slogdet(Y)[1])
+    np.testing.assert_allclose(g.kl(Y, F), expected, rtol=1e-10)
+
+
+def test_kl_is_invariant_under_a_change_of_frame() -> None:
+    rng = np.random.default_rng(10)
+    Y, F = covariances(60, rng).reshape(2, 30, 6, 6)
+    A = rng.standard_normal((30, 6, 6)) + 3 * EYE
+    At = np.swapaxes(A, 1, 2)
+    moved = g.kl(g.symmetrized(A @ Y @ At), g.symmetrized(A @ F @ At))
+    np.testing.assert_allclose(moved, g.kl(Y, F), rtol=1e-7)
+
+
+def test_kl_holds_at_a_determinant_of_1e_40_and_far_below() -> None:
+    Y, F = covariances(2, np.random.default_rng(11))
+    for scale in (10 ** (-40 / 6), 1e-40, 1e40):
+        assert g.kl(scale * Y, scale * F) == pytest.approx(float(g.kl(Y, F)), rel=1e-12)
+    units = np.outer(s := [1e-2] * 3 + [1e-12] * 3, s)
+    assert g.kl(units * Y, units * F) == pytest.approx(float(g.kl(Y, F)), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("n", "trials", "floor"), [(65, 400, 0.168), (500, 200, 0.021), (5000, 60, 0.0021)]
+)
+def test_kl_of_sampled_against_true_covariance_has_a_known_floor(
+    n: int, trials: int, floor: float
+) -> None:
+    rng = np.random.default_rng(12)
+    L = np.linalg.cholesky(covariances(1, rng, 1e-4)[0])
+    Y = g.sampled_covariance(rng.standard_normal((trials, n, 6)) @ L.T)
+    assert g.kl(Y, L @ L.T).mean() == pytest.approx(floor, rel=0.2)
+
+
+def test_kl_refuses_a_singular_matrix() -> None:
+    with pytest.raises(np.linalg.LinAlgError):
+        g.kl(EYE, np.diag([1.0, 1, 1, 1, 1, 0]))
+
+
+def test_mahalanobis_counts_standard_deviations() -> None:
+    assert g.mahalanobis([0, 0, 3.0, 0, 0, 0], np.diag([1, 1, 4.0, 1, 1, 1])) == 1.5
+    rng = np.random.default_rng(13)
+    Y, xi = covariances(40, rng), rng.standard_normal((40, 6))
+    expected = [np.sqrt(x @ np.linalg.inv(C) @ x) for x, C in zip(xi, Y, strict=True)]
+    np.testing.assert_allclose(g.mahalanobis(xi, Y), expected, rtol=1e-10)
+    A = rng.standard_normal((6, 6))
+    moved = g.mahalanobis(xi @ A.T, g.symmetrized(A @ Y @ A.T))
+    np.testing.assert_allclose(moved, expected, rtol=1e-7)
+
+
+def test_mahalanobis_broadcasts_samples_against_covariances() -> None:
+    rng = np.random.default_rng(14)
+    Y, xi = covariances(3, rng), rng.standard_normal((10, 1, 6))
+    assert g.mahalanobis(xi, Y).shape == (10, 3)
+    assert g.mahalanobis(xi[:, 0], Y[0]).shape == (10,)
+    np.testing.assert_allclose(g.mahalanobis(xi, Y)[:, 1], g.mahalanobis(xi[:, 0], Y[1]))
+
+
+# --- matrices -------------------------------------------------------------------------------
+
+
+def test_positive_definite_is_judged_without_units() -> None:
+    Y = covariances(30, np.random.default_rng(15))
+    units = np.outer(s := [1e-3] * 3 + [1e-15] * 3, s)
+    assert g.is_positive_definite(Y).all() and g.is_positive_definite(1e-40 * Y).all()
+    assert g.is_positive_definite(units * Y).all()
+
+
+def test_what_is_not_positive_definite_is_found_in_its_place() -> None:
+    indefinite = EYE.copy()
+    indefinite[0, 1] = indefinite[1, 0] = 1.0 + 1e-12
+    singular = EYE + np.outer([1, 1, 0, 0, 0, 0], [1, 1, 0, 0, 0, 0])
+    singular[:2, :2] = 1.0
+    lopsided = EYE.copy()
+    lopsided[0, 1] = 1e-6
+    nan, negative = EYE.copy(), np.diag([1.0, 1, 1, 1, 1, -1])
+    nan[2, 2] = np.nan
+    batch = np.array(
+        [
+            EYE,
+            indefinite,
+            singular,
+            lopsided,
+            nan,
+            negative,
+            0 * EYE,
+            np.full((6, 6), np.inf),
+            2 * EYE,
+        ]
+    )
+    expected = [True, *[False] * 7, True]
+    np.testing.assert_array_equal(g.is_positive_definite(batch), expected)
+    for Y, fine in zip(batch, expected, strict=True):
+        assert bool(g.is_positive_definite(Y)) is fine
+
+
+def test_roots_multiply_back_and_are_symmetric() -> None:
+    S = covariances(20, np.random.default_rng(16), 1e-6)
+    R, R_inv = g.matrix_sqrt(S), g.matrix_inverse_sqrt(S)
+    np.testing.assert_allclose(R @ R, S, atol=1e-18)
+    np.testing.assert_allclose(R_inv @ S @ R_inv, np.broadcast_to(EYE, S.shape), atol=1e-10)
+    np.testing.assert_array_equal(R, np.swapaxes(R, 1, 2))
+    with pytest.raises(np.linalg.LinAlgError):
+        g.matrix_sqrt(-EYE)
+
+
+def test_arguments_stay_as_they_were() -> None:
+    rng = np.random.default_rng(17)
+    A, B, Ya, Yb = T1.copy(), T2.copy(), *covariances(2, rng, 0.01)
+    xi = rng.standard_normal((9, 6))
+    before = [a.copy() for a in (A, B, Ya, Yb, xi)]
+    g.compound_right(A, Ya, B, Yb)
+    g.kl(Ya, Yb), g.mahalanobis(xi, Ya), g.sampled_covariance(xi, xi[0]), g.matrix_sqrt(Ya)
+    for array, copy in zip((A, B, Ya, Yb, xi), before, strict=True):
+        np.testing.assert_array_equal(array, copy)
