@@ -67,7 +67,8 @@ def ros_covariance(
     position and of the rotation about fixed axes, both along the axes of header.frame_id.
     Y: (6, 6), ordered (u, omega).  R_header_read: (3, 3).  Returns (6, 6) in m^2 and rad^2,
     exactly symmetric, positive definite, ``C - diag(floor_sigma_m^2, floor_sigma_rad^2)``
-    positive semidefinite and no eigenvalue above ``ceiling``.  Raises CovarianceError for a Y that is not finite.
+    positive semidefinite and no eigenvalue above ``ceiling``.  Raises CovarianceError for a Y
+    that is not finite.
     """
     if np.shape(Y) != (6, 6) or not np.isfinite(Y).all():
         raise CovarianceError("the covariance is not finite")

@@ -1,0 +1,124 @@
+"""Which cloud is worked on next: order of stamps, waiting for odometry, newest wins.  No ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.ros.odometry import OdometryBuffer, OdometryError, OdometryNotYetError
+
+JUMP_NS = (
+    1_000_000_000  # a stamp that goes back by more than this is a clock set back, a bag looped
+)
+
+_N_SLOTS = 2
+
+
+@dataclass(frozen=True)
+class Skip:
+    """A cloud that will not be answered: its stamp, a reason to count by, and one sentence."""
+
+    stamp_ns: int
+    reason: str
+    sentence: str
+
+
+@dataclass
+class Job:
+    """A cloud on its way: when it came (time.monotonic) and, in the end, where odometry puts it.
+
+    points: (N, 3), sensor frame.  T_odom_base: (4, 4), at the stamp.
+    """
+
+    stamp_ns: int
+    points: Array
+    frame_id: str
+    received_s: float
+    waited_s: float = 0.0
+    T_odom_base: Array | None = None
+
+
+def stamp_order(stamp_ns: int, newest_ns: int | None) -> str:
+    """Return "later", or why not: "duplicate_stamp", "out_of_order" or "jump"."""
+    if newest_ns is None or stamp_ns > newest_ns:
+        return "later"
+    if stamp_ns == newest_ns:
+        return "duplicate_stamp"
+    return "jump" if newest_ns - stamp_ns > JUMP_NS else "out_of_order"
+
+
+class Intake:
+    """At most two clouds wait for their odometry: the oldest and the newest.
+
+    A cloud between them is dropped, so that nothing queues up; the oldest keeps its place, so
+    that odometry which is always late by more than a period of the clouds starves nobody.  Of
+    the clouds whose odometry is there the newest is taken and the others are dropped.
+    """
+
+    def __init__(self, odometry: OdometryBuffer) -> None:
+        self._odometry = odometry
+        self._waiting: list[Job] = []
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def clear(self) -> list[Skip]:
+        """Forget the clouds that wait: time has jumped."""
+        dropped = [
+            Skip(job.stamp_ns, "clock_jump", "time jumped back while it waited")
+            for job in self._waiting
+        ]
+        self._waiting.clear()
+        return dropped
+
+    def offer(self, job: Job) -> list[Skip]:
+        """Let a cloud wait, later than all that wait; return what it displaced."""
+        displaced = self._waiting[_N_SLOTS - 1 :]
+        self._waiting[_N_SLOTS - 1 :] = [job]
+        return [_superseded(old) for old in displaced]
+
+    def take(self) -> tuple[Job | None, list[Skip]]:
+        """Return the newest cloud whose odometry is there, if any, and what was dropped."""
+        skips = []
+        for i in reversed(range(len(self._waiting))):
+            job = self._waiting[i]
+            try:
+                job.T_odom_base = self._odometry.at(job.stamp_ns)
+            except OdometryNotYetError:
+                continue
+            except OdometryError as error:
+                skips.append(_without_odometry(job, error))
+                del self._waiting[i]
+                continue
+            skips += [_superseded(old) for old in self._waiting[:i]]
+            del self._waiting[: i + 1]
+            return job, skips
+        return None, skips
+
+    def expire(self, elapsed_s: float, timeout_s: float) -> list[Skip]:
+        """Drop the clouds that have now waited ``timeout_s``.
+
+        ``elapsed_s`` counts only time in which odometry could have been heard: a node that was
+        busy must not blame the odometry.
+        """
+        skips, kept = [], []
+        for job in self._waiting:
+            job.waited_s += elapsed_s
+            if job.waited_s < timeout_s:
+                kept.append(job)
+                continue
+            try:
+                self._odometry.at(job.stamp_ns)
+                kept.append(job)
+            except OdometryError as error:
+                skips.append(_without_odometry(job, error))
+        self._waiting = kept
+        return skips
+
+
+def _superseded(job: Job) -> Skip:
+    return Skip(job.stamp_ns, "superseded", "a newer cloud came before it could be worked on")
+
+
+def _without_odometry(job: Job, error: OdometryError) -> Skip:
+    return Skip(job.stamp_ns, "no_odometry", f"no odometry at the stamp of the cloud: {error}")

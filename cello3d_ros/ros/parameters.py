@@ -1,0 +1,135 @@
+"""ROS parameters from the configuration: declared by walking its sections, checked by it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterTypeException, ParameterException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from cello3d_ros.config import SECTIONS, Config
+from cello3d_ros.errors import ConfigError
+
+MODEL = "node.model"
+
+_FIXED = {"cloud", "grid", "sampling", "training"}  # sections read once, when the node starts
+_FIXED_SETTINGS = {MODEL, "node.T_base_sensor", "node.odometry_buffer_s", "node.seed"}
+_INT64 = 2**63 - 1
+
+
+def declare_model(node: Node) -> str:
+    """Declare and return ``node.model`` alone: the defaults of the others come from the model."""
+    field = next(f for f in dataclasses.fields(SECTIONS["node"]) if f.name == "model")
+    return str(_declare(node, MODEL, field, field.default))
+
+
+def declare(node: Node, defaults: Config) -> Config:
+    """Declare every setting as ``section.name`` and return what they are set to.
+
+    Raises ConfigError naming the parameter, its value and what is allowed.
+    """
+    given = overrides(node)
+    values: dict[str, Any] = {}
+    for section in SECTIONS:
+        _built(section, _of(section, given))
+        for field in dataclasses.fields(SECTIONS[section]):
+            name = f"{section}.{field.name}"
+            default = getattr(getattr(defaults, section), field.name)
+            if node.has_parameter(name):
+                values[name] = node.get_parameter(name).value
+            else:
+                values[name] = _declare(node, name, field, default)
+    return _config(values)
+
+
+def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
+    """Return the configuration with some parameters set anew.  Raises ConfigError."""
+    values = {
+        f"{section}.{field.name}": getattr(getattr(config, section), field.name)
+        for section in SECTIONS
+        for field in dataclasses.fields(SECTIONS[section])
+    }
+    new = {parameter.name: parameter.value for parameter in parameters}
+    return _config({name: new.get(name, value) for name, value in values.items()})
+
+
+def overrides(node: Node) -> dict[str, Any]:
+    """Return the parameters given to the node from outside, by files or ``-p``."""
+    return {name: given.value for name, given in node._parameter_overrides.items()}
+
+
+def unknown(node: Node) -> list[str]:
+    """Return the names given from outside that the node does not have."""
+    return sorted(
+        name
+        for name in overrides(node)
+        if not node.has_parameter(name) and not name.startswith("qos_overrides.")
+    )
+
+
+def _declare(node: Node, name: str, field: dataclasses.Field[Any], default: Any) -> Any:
+    value = list(default) if isinstance(default, tuple) else default
+    try:
+        return node.declare_parameter(name, value, _descriptor(name, field)).value
+    except InvalidParameterTypeException:
+        given = overrides(node)[name]
+        kind = _kind(field.default)
+        hint = " (write a decimal point, such as 1.0)" if "float" in kind else ""
+        raise ConfigError(f"parameter {name} must be of type {kind}{hint}: {given!r}") from None
+    except ParameterException as error:
+        raise ConfigError(f"parameter {name}: {error}") from None
+
+
+def _descriptor(name: str, field: dataclasses.Field[Any]) -> ParameterDescriptor:
+    low, high = field.metadata["low"], field.metadata["high"]
+    descriptor = ParameterDescriptor(
+        name=name,
+        description=field.metadata["doc"],
+        read_only=name.split(".")[0] in _FIXED or name in _FIXED_SETTINGS,
+    )
+    if field.metadata["choices"]:
+        descriptor.additional_constraints = "one of " + ", ".join(field.metadata["choices"])
+    elif isinstance(field.default, tuple) and (low, high) != (-math.inf, math.inf):
+        descriptor.additional_constraints = f"each in [{low:g}, {high:g}]"
+    elif type(field.default) is float:
+        span = FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)
+        descriptor.floating_point_range = [span]
+    elif type(field.default) is int:
+        ends = (int(max(-_INT64, min(_INT64, end))) for end in (low, high))
+        descriptor.integer_range = [IntegerRange(from_value=next(ends), to_value=next(ends))]
+    return descriptor
+
+
+def _kind(default: Any) -> str:
+    if isinstance(default, tuple):
+        return f"list of {type(default[0]).__name__}"
+    return type(default).__name__
+
+
+def _of(section: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values whose names are settings of one section, by their short names."""
+    known = {field.name for field in dataclasses.fields(SECTIONS[section])}
+    return {name: values[f"{section}.{name}"] for name in known if f"{section}.{name}" in values}
+
+
+def _config(values: dict[str, Any]) -> Config:
+    return Config(**{section: _built(section, _of(section, values)) for section in SECTIONS})
+
+
+def _built(section: str, values: dict[str, Any]) -> Any:
+    """Build a section; ConfigError speaks of parameters as they are called in ROS."""
+    kind = SECTIONS[section]
+    plain = {
+        name: value if isinstance(value, (bool, int, float, str)) else tuple(value)
+        for name, value in values.items()
+    }
+    try:
+        return kind(**plain)
+    except ConfigError as error:
+        text = str(error).replace(f"{kind.__name__}.", f"parameter {section}.")
+        raise ConfigError(text) from None

@@ -1,0 +1,120 @@
+"""Order of clouds, waiting for odometry, newest wins."""
+
+import numpy as np
+import pytest
+
+from cello3d_ros.ros.intake import Intake, Job, stamp_order
+from cello3d_ros.ros.odometry import OdometryBuffer
+
+S = 1_000_000_000
+
+
+def job(stamp_ns: int) -> Job:
+    return Job(stamp_ns, np.empty((0, 3)), "lidar", received_s=0.0)
+
+
+def odometry(*stamps: int) -> OdometryBuffer:
+    buffer = OdometryBuffer(100.0, 1.0)
+    for stamp_ns in stamps:
+        buffer.add(stamp_ns, np.eye(4))
+    return buffer
+
+
+@pytest.mark.parametrize(
+    ("stamp_ns", "expected"),
+    [
+        (9 * S + 1, "later"),
+        (9 * S, "duplicate_stamp"),
+        (9 * S - 1, "out_of_order"),
+        (8 * S, "out_of_order"),
+        (8 * S - 1, "jump"),
+    ],
+)
+def test_order_of_stamps(stamp_ns: int, expected: str) -> None:
+    assert stamp_order(stamp_ns, 9 * S) == expected
+    assert stamp_order(stamp_ns, None) == "later"
+
+
+def test_a_cloud_waits_for_its_odometry_and_then_comes_out_with_it() -> None:
+    buffer = odometry(S)
+    intake = Intake(buffer)
+    assert intake.offer(job(S + S // 2)) == []
+    assert intake.take() == (None, [])
+    buffer.add(2 * S, np.eye(4))
+    taken, skips = intake.take()
+    assert taken is not None and taken.stamp_ns == S + S // 2
+    np.testing.assert_array_equal(taken.T_odom_base, np.eye(4))
+    assert (skips, len(intake)) == ([], 0)
+
+
+def test_the_newest_cloud_wins_and_the_older_is_counted() -> None:
+    intake = Intake(odometry(S, 2 * S, 3 * S))
+    intake.offer(job(S))
+    intake.offer(job(2 * S))
+    taken, skips = intake.take()
+    assert taken is not None and taken.stamp_ns == 2 * S
+    assert [(skip.stamp_ns, skip.reason) for skip in skips] == [(S, "superseded")]
+
+
+def test_a_newer_cloud_without_odometry_does_not_hold_up_the_older() -> None:
+    intake = Intake(odometry(S))
+    intake.offer(job(S))
+    intake.offer(job(2 * S))
+    taken, skips = intake.take()
+    assert taken is not None and taken.stamp_ns == S
+    assert (skips, len(intake)) == ([], 1)
+
+
+def test_odometry_late_by_many_periods_starves_nobody() -> None:
+    buffer = odometry(0)
+    intake = Intake(buffer)
+    answered = []
+    for i in range(1, 40):  # ten clouds a second, odometry half a second late
+        intake.offer(job(i * S // 10))
+        if i > 5:
+            buffer.add((i - 5) * S // 10, np.eye(4))
+        taken, _ = intake.take()
+        if taken is not None:
+            answered.append(taken.stamp_ns)
+    assert len(answered) >= 6
+    assert answered == sorted(answered)
+
+
+def test_never_more_than_two_wait_and_every_displaced_cloud_is_counted() -> None:
+    intake = Intake(odometry())
+    skips = [skip for i in range(10) for skip in intake.offer(job(i * S))]
+    assert len(intake) == 2
+    assert [skip.stamp_ns // S for skip in skips] == list(range(1, 9))
+
+
+def test_a_cloud_older_than_all_odometry_is_skipped_at_once() -> None:
+    intake = Intake(odometry(5 * S))
+    intake.offer(job(S))
+    taken, skips = intake.take()
+    assert taken is None and len(intake) == 0
+    assert skips[0].reason == "no_odometry"
+    assert "4.000 s newer" in skips[0].sentence
+
+
+def test_a_cloud_expires_after_the_timeout_of_listening() -> None:
+    intake = Intake(odometry(S))
+    intake.offer(job(2 * S))
+    assert intake.expire(0.25, 0.5) == []
+    skips = intake.expire(0.25, 0.5)
+    assert [skip.reason for skip in skips] == ["no_odometry"]
+    assert "1.000 s older" in skips[0].sentence
+    assert len(intake) == 0
+
+
+def test_a_cloud_whose_odometry_has_come_does_not_expire() -> None:
+    intake = Intake(odometry(S))
+    intake.offer(job(S))
+    assert intake.expire(10.0, 0.5) == []
+    assert intake.take()[0] is not None
+
+
+def test_clear_names_what_it_forgot() -> None:
+    intake = Intake(odometry())
+    intake.offer(job(S))
+    assert [skip.reason for skip in intake.clear()] == ["clock_jump"]
+    assert len(intake) == 0
