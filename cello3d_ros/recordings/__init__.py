@@ -1,1 +1,6 @@
 """Recorded and simulated sequences of scans."""
+
+from cello3d_ros.recordings.opening import open_recording
+from cello3d_ros.recordings.recording import Recording, Scan
+
+__all__ = ["Recording", "Scan", "open_recording"]

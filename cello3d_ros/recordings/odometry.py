@@ -45,23 +45,23 @@ def drift_odometry(
 class PoseTrack:
     """Stamped poses, looked up at any time between the first and the last."""
 
-    def __init__(self, stamps_ns: ArrayLike, positions: ArrayLike, quaternions: ArrayLike) -> None:
+    def __init__(self, stamps_ns: ArrayLike, rows: ArrayLike) -> None:
         """Sort by stamp; of several poses with one stamp the last given counts.
 
-        stamps_ns: (n,).  positions: (n, 3).  quaternions: (n, 4), x y z w.
+        stamps_ns: (n,).  rows: (n, 7), position x y z and quaternion x y z w.
         Raises RecordingError for a pose that is not finite or has a quaternion of length 0.
         """
         stamps = np.asarray(stamps_ns, dtype=np.int64).reshape(-1)
-        positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
-        quaternions = np.asarray(quaternions, dtype=np.float64).reshape(-1, 4)
-        bad = ~np.isfinite(positions).all(axis=1) | ~_is_usable(quaternions)
+        rows = np.asarray(rows, dtype=np.float64).reshape(-1, 7)
+        with np.errstate(invalid="ignore", over="ignore"):
+            bad = ~np.isfinite(rows).all(axis=1) | (np.linalg.norm(rows[:, 3:], axis=1) < 1e-6)
         if bad.any():
             raise RecordingError(f"pose {int(np.argmax(bad))} is not finite or has no rotation")
         order = np.argsort(stamps, kind="stable")
         last = np.append(np.diff(stamps[order]) > 0, True)[: len(order)]
         keep = order[last]
         self.stamps_ns: NDArray[np.int64] = stamps[keep]
-        self._positions, self._quaternions = positions[keep], quaternions[keep]
+        self._rows: Array = rows[keep]
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -82,10 +82,4 @@ class PoseTrack:
         return se3.interpolate(self._pose(k - 1), self._pose(k), share)
 
     def _pose(self, k: int) -> Array:
-        return se3.pose(self._positions[k], self._quaternions[k])
-
-
-def _is_usable(quaternions: Array) -> NDArray[np.bool_]:
-    with np.errstate(invalid="ignore", over="ignore"):
-        length = np.linalg.norm(quaternions, axis=1)
-    return np.asarray(np.isfinite(length) & (length > 1e-6))
+        return se3.pose(self._rows[k, :3], self._rows[k, 3:])
