@@ -115,7 +115,7 @@ class Dataset:
         elif change := _first_difference(known, json.loads(json.dumps(facts))):
             raise DatasetError(f"{self.path} holds another recording named {name!r}: {change}")
 
-    def keys(self) -> list[tuple[str, int, int]]:
+    def pair_keys(self) -> list[tuple[str, int, int]]:
         """Return the pairs on disk, damaged ones too, ordered by recording, i, j."""
         return sorted(_key_of(path) for path in (self.path / "pairs").glob("[!.]*.npz"))
 
@@ -156,11 +156,11 @@ class Dataset:
             raise DatasetError(f"refused to write {path}: {error}") from None
 
     def __iter__(self) -> Iterator[PairRecord]:
-        for key in self.keys():
+        for key in self.pair_keys():
             yield self.read(*key)
 
     def __len__(self) -> int:
-        return len(self.keys())
+        return len(self.pair_keys())
 
     def _file(self, recording: str, i: int, j: int) -> Path:
         _check_name(recording)
@@ -176,7 +176,8 @@ def open_dataset(
     """Open a dataset folder; with ``create``, begin one where there is none.
 
     Settings that are given must be those of the folder: DatasetError names the first that is not.
-    With ``create``, leftovers of interrupted writes are removed: one process samples into a folder.
+    With ``create``, leftovers of interrupted writes are removed: one process at a time samples
+    into a folder.
     """
     path = Path(path)
     if create:
@@ -200,7 +201,7 @@ def _begin(path: Path, pipeline: Pipeline, sampling: SamplingConfig) -> None:
         "format": FORMAT,
         "conventions": CONVENTIONS,
         "configuration": _configuration(pipeline, sampling),
-        "versions": _versions(),
+        "versions": package_versions(),
         "recordings": {},
     }
     _write_manifest(path, manifest)
@@ -210,7 +211,8 @@ def _configuration(pipeline: Pipeline, sampling: SamplingConfig) -> dict[str, di
     return {**config_to(pipeline_of(pipeline)), "sampling": dataclasses.asdict(sampling)}
 
 
-def _versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
+    """Return the versions of what numbers depend on: Python and the packages below."""
     versions = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
@@ -273,8 +275,9 @@ def _unpacked(arrays: dict[str, Any]) -> PairRecord:
 
 def _check(record: PairRecord) -> None:
     """Raise ValueError unless the record may stand in a dataset."""
-    for name in _ARRAYS:
-        if not np.isfinite(getattr(record, name)).all():
+    arrays = {name: getattr(record, name) for name in _ARRAYS}
+    for name, array in {**arrays, **record.shapes}.items():
+        if not np.isfinite(array).all():
             raise ValueError(f"{name} is not finite")
     n_samples = len(record.xi)
     if record.xi.shape != (n_samples, 6) or record.kept.shape != (n_samples,):

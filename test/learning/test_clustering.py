@@ -25,7 +25,7 @@ def noise(n: int, seed: int = 0) -> Array:
 
 @pytest.mark.parametrize("n", [65, 500, 5000])
 def test_of_two_clusters_the_one_nearest_ground_truth_is_kept(n: int) -> None:
-    near, far = noise(n), noise(2 * n, 1) + [0.6, 0, 0, 0, 0, 0.3]
+    near, far = noise(n), noise(2 * n, 1) + np.array([0.6, 0, 0, 0, 0, 0.3])
     mask = kept(np.concatenate([far, near]))
     assert not mask[: 2 * n].any()
     assert mask[2 * n :].mean() > 0.98
@@ -60,7 +60,7 @@ def test_the_ring_goes_although_its_mean_is_nearest_to_ground_truth() -> None:
     axis = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
     ring = noise(1000, 4)
     ring[:, 3:5] += np.pi * np.stack([np.cos(axis), np.sin(axis)], axis=1)
-    biased = noise(1000, 5) + [0.2, 0, 0, 0, 0, 0.1]
+    biased = noise(1000, 5) + np.array([0.2, 0, 0, 0, 0, 0.1])
     assert np.linalg.norm(ring.mean(axis=0)) < np.linalg.norm(biased.mean(axis=0))
     mask = kept(np.concatenate([ring, biased]))
     assert not mask[:1000].any()

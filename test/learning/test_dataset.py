@@ -77,7 +77,7 @@ def test_iteration_is_ordered_by_recording_i_j_as_numbers(dataset: Dataset) -> N
     for name, i, j in [("b_2", 2, 3), ("b_2", 10, 11), ("a", 1, 2), ("a", 0, 2), ("b_2", 2, 11)]:
         dataset.write(accepted(name, i, j))
     wanted = [("a", 0, 2), ("a", 1, 2), ("b_2", 2, 3), ("b_2", 2, 11), ("b_2", 10, 11)]
-    assert [record.key for record in dataset] == wanted == dataset.keys()
+    assert [record.key for record in dataset] == wanted == dataset.pair_keys()
     assert len(dataset) == 5
 
 
@@ -170,7 +170,15 @@ def test_a_pair_file_under_the_name_of_another_is_damage(dataset: Dataset) -> No
         ({"shapes": {"hessian": -np.eye(6)}}, "hessian is not a positive definite"),
         ({"descriptors": np.zeros((3, 704), np.float32)}, "4 rotations"),
         ({"shapes": {"hessian": np.eye(3)}}, "hessian is not a positive definite"),
-        ({"shapes": {"hessian": np.full((6, 6), np.nan)}}, "hessian is not a positive definite"),
+        ({"shapes": {"hessian": np.full((6, 6), np.nan)}}, "hessian is not finite"),
+        (
+            {
+                "accepted": False,
+                "reason": "offset",
+                "shapes": {"hessian": np.full((6, 6), np.nan)},
+            },
+            "hessian is not finite",
+        ),
         ({"overlap_ratio": float("nan")}, "refused to write"),
         ({"kept": np.ones(3, np.bool_)}, "disagree"),
         ({"T_mean": np.eye(3)}, "T_mean has shape"),
@@ -183,7 +191,7 @@ def test_unfit_records_are_refused_and_leave_nothing(
     with pytest.raises(DatasetError, match=sentence):
         dataset.write(dataclasses.replace(accepted(), **change))  # type: ignore[arg-type]
     assert not dataset.has("hall", 0, 1)
-    assert dataset.keys() == []
+    assert dataset.pair_keys() == []
 
 
 def test_leftovers_of_an_interrupted_write_are_removed(dataset: Dataset) -> None:

@@ -1,0 +1,404 @@
+"""Checks 15 to 17 of the design: gradient, planted data, noise; and who may see whom."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cello3d_ros.config import CloudConfig, Pipeline, SamplingConfig, TrainingConfig
+from cello3d_ros.covariance.model import predict
+from cello3d_ros.errors import DatasetError
+from cello3d_ros.geometry.gaussian import is_positive_definite, kl, matrix_sqrt
+from cello3d_ros.geometry.se3 import Array, adjoint, exp
+from cello3d_ros.learning.dataset import Dataset, PairRecord, open_dataset
+from cello3d_ros.learning.training import (
+    Examples,
+    Problem,
+    leave_out_problem,
+    load_examples,
+    loss_and_gradient,
+    predicted,
+    train,
+)
+
+PAPER = TrainingConfig(shape="none", theta="diagonal", mean_weight=0.0, regularization=1e-3)
+SIZE = np.diag([1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2])  # det of SIZE SIZE^T is 1e-24
+
+
+def covariances(n: int, rng: np.random.Generator, degrees: int = 12) -> Array:
+    A = SIZE @ rng.normal(size=(n, 6, degrees)) / np.sqrt(degrees)
+    return A @ np.swapaxes(A, 1, 2)
+
+
+def some(
+    n: int = 24, n_features: int = 5, seed: int = 0, rotations: tuple[float, ...] = (0.0,)
+) -> Examples:
+    rng = np.random.default_rng(seed)
+    Y = covariances(n, rng)
+    return Examples(
+        features=rng.normal(size=(n, len(rotations), n_features)).astype(np.float32),
+        covariances=Y,
+        groups=np.array([f"world_s{k % 3}" for k in range(n)]),
+        shapes={"sandwich": covariances(n, rng), "hessian": covariances(n, rng)},
+        rotations_rad=np.array(rotations),
+        xi=tuple(rng.multivariate_normal(np.zeros(6), Y_k, size=50) for Y_k in Y),
+    )
+
+
+def planted(n: int = 300, seed: int = 0, n_groups: int = 5) -> Examples:
+    """Covariances of random shape, in which feature 3 of 10 decides how large they are."""
+    rng = np.random.default_rng(seed)
+    features = rng.normal(size=(n, 1, 10)).astype(np.float32)
+    sizes = np.exp(2.0 * features[:, 0, 3].astype(np.float64))
+    return dataclasses.replace(
+        some(n, 10),
+        features=features,
+        covariances=sizes[:, None, None] * covariances(n, rng, 40),
+        groups=np.array([f"g{seed}_{k % n_groups}" for k in range(n)]),
+        xi=(),
+    )
+
+
+def noise(n: int, seed: int) -> Examples:
+    rng = np.random.default_rng(seed)
+    return dataclasses.replace(
+        planted(n, seed), features=rng.normal(size=(n, 1, 10)).astype(np.float32)
+    )
+
+
+def a_problem(mean_weight: float = 0.05, rotations: tuple[float, ...] = (0.0, 1.0)) -> Problem:
+    config = TrainingConfig(shape="none", mean_weight=mean_weight)
+    examples = some(rotations=rotations)
+    return leave_out_problem(examples, config, np.zeros(5), np.ones(5))
+
+
+THETAS = {
+    "upper_triangular": np.triu(np.random.default_rng(1).normal(size=(5, 5)) * 0.4),
+    "diagonal": np.random.default_rng(2).normal(size=5) * 0.4,
+    "low_rank": np.random.default_rng(3).normal(size=(2, 5)) * 0.4,
+}
+
+
+@pytest.mark.parametrize("form", THETAS)
+@pytest.mark.parametrize("loss", ["log_det", "paper"])
+@pytest.mark.parametrize("mean_weight", [0.0, 0.3])
+def test_gradient_is_that_of_finite_differences(form: str, loss: str, mean_weight: float) -> None:
+    theta, problem = THETAS[form], a_problem(mean_weight)
+    assert -26 < np.median(np.linalg.slogdet(problem.Y)[1]) / np.log(10) < -22
+    _, gradient = loss_and_gradient(theta, problem, loss)
+    numeric = np.zeros_like(theta)
+    for index in np.ndindex(theta.shape):
+        step = np.zeros_like(theta)
+        step[index] = 1e-3
+
+        def value(t: float, step: Array = step) -> float:
+            return loss_and_gradient(theta + t * step, problem, loss)[0]
+
+        near, far = (value(1) - value(-1)) / 2e-3, (value(2) - value(-2)) / 4e-3
+        numeric[index] = (4 * near - far) / 3
+    if form == "upper_triangular":
+        gradient, numeric = np.triu(gradient), np.triu(numeric)
+    assert np.linalg.norm(gradient - numeric) < 1e-6 * np.linalg.norm(numeric)
+
+
+def test_det_and_its_gradient_are_those_of_the_printed_loss() -> None:
+    problem = a_problem()
+    larger = dataclasses.replace(
+        problem,
+        Y=problem.Y * 1e4,
+        packed_examples=problem.packed_examples * 1e4,
+        means=problem.means * 1e4,
+    )  # det is about 1: neither term drowns
+    theta, step = THETAS["low_rank"], np.random.default_rng(5).normal(size=(2, 5)) * 1e-3
+    F = predicted(theta, larger)
+    fit = np.trace(np.linalg.solve(F, larger.Y), axis1=1, axis2=2)
+    loss, gradient = loss_and_gradient(theta, larger, "paper")
+    assert loss == pytest.approx(np.mean(np.linalg.det(F) + fit))
+    ahead, behind = (
+        loss_and_gradient(theta + sign * step, larger, "paper")[0] for sign in (1, -1)
+    )
+    assert np.sum(gradient * step) == pytest.approx((ahead - behind) / 2, rel=1e-4)
+
+
+def test_loss_at_the_covariance_itself_is_ln_det_plus_6_and_higher_beside_it() -> None:
+    Y = covariances(1, np.random.default_rng(0))
+    packed = Y[0][np.triu_indices(6)]
+
+    def loss(factor: float) -> float:
+        problem = Problem(
+            X=np.zeros((1, 1)),
+            Y=Y,
+            groups=np.array([0]),
+            X_examples=np.zeros((1, 1)),
+            packed_examples=factor * packed[None],
+            groups_examples=np.array([1]),
+            means=factor * packed[None],
+            mean_weight=0.0,
+        )
+        return loss_and_gradient(np.zeros(1), problem)[0]
+
+    assert loss(1.0) == pytest.approx(np.linalg.slogdet(Y[0])[1] + 6, abs=1e-9)
+    assert loss(0.5) > loss(1.0) + 1
+    assert loss(2.0) > loss(1.0) + 1
+
+
+def test_zero_theta_predicts_the_mean_of_the_other_recordings() -> None:
+    examples, problem = some(), a_problem(0.0, (0.0,))
+    F = predicted(np.zeros(5), problem)
+    for k in range(24):
+        others = examples.covariances[examples.groups != examples.groups[k]]
+        np.testing.assert_allclose(F[k], others.mean(axis=0), rtol=1e-12)
+
+
+@pytest.mark.parametrize("mean_weight", [0.0, 0.5])
+def test_an_example_never_sees_its_own_recording(mean_weight: float) -> None:
+    examples = some(rotations=(0.0, np.pi / 2))
+    config = TrainingConfig(shape="none", mean_weight=mean_weight)
+    own = examples.groups == "world_s1"
+    changed = dataclasses.replace(
+        examples, covariances=np.where(own[:, None, None], 1e6 * np.eye(6), examples.covariances)
+    )
+    theta = THETAS["upper_triangular"]
+    before, after = (
+        predicted(theta, leave_out_problem(some_, config, np.zeros(5), np.ones(5)))
+        for some_ in (examples, changed)
+    )
+    np.testing.assert_array_equal(before[own], after[own])
+    assert (np.abs(after[~own] - before[~own]).max(axis=(1, 2)) > 1e-9).all()
+
+
+def test_planted_feature_is_found_and_beats_the_mean() -> None:
+    config = dataclasses.replace(PAPER, theta="upper_triangular")
+    training = train(planted(seed=0), config, planted(100, seed=1))
+    figures = training.figures["validation"]
+    assert figures["model"]["kl_mean"] < 0.3 * figures["mean_covariance"]["kl_mean"]
+    weights = np.linalg.norm(training.model.theta / training.model.scale, axis=0)
+    assert np.argmax(weights) == 3
+    assert weights[3] > 3 * np.delete(weights, 3).max()
+
+
+@pytest.mark.parametrize("form", ["upper_triangular", "diagonal", "low_rank"])
+def test_pure_noise_is_within_two_percent_of_the_mean(form: str) -> None:
+    config = dataclasses.replace(PAPER, theta=form, rank=4, regularization=0.03)
+    training = train(noise(400, 2), config, noise(200, 3))
+    unseen = noise(300, 4)
+    F = np.array([predict(training.model, d[0]).covariance for d in unseen.features])
+    baseline = np.tile(noise(400, 2).covariances.mean(axis=0), (300, 1, 1))
+    assert kl(unseen.covariances, F).mean() < 1.02 * kl(unseen.covariances, baseline).mean()
+
+
+@pytest.mark.parametrize("form", ["upper_triangular", "diagonal", "low_rank"])
+@pytest.mark.parametrize("shape", ["none", "hessian", "sandwich"])
+def test_the_model_predicts_as_training_judged_it(form: str, shape: str) -> None:
+    examples, validation = some(seed=0, rotations=(0.0, 0.5)), some(9, seed=1)
+    validation = dataclasses.replace(validation, groups=np.array(["v"] * 9))
+    config = TrainingConfig(shape=shape, theta=form, rank=2, max_iterations=5, mean_weight=0.1)
+    training = train(examples, config, validation)
+    F = np.array(
+        [
+            predict(training.model, d[0], None if shape == "none" else S).covariance
+            for d, S in zip(
+                validation.features, validation.shapes.get(shape, [None] * 9), strict=True
+            )
+        ]
+    )
+    divergence = kl(validation.covariances, F)
+    figures = training.figures["validation"]["model"]
+    assert figures["kl_mean"] == pytest.approx(divergence.mean(), rel=1e-9)
+    assert figures["kl_median"] == pytest.approx(np.median(divergence), rel=1e-9)
+    assert is_positive_definite(F).all()
+
+
+def test_a_turned_copy_predicts_the_turned_covariance() -> None:
+    examples = some(6, rotations=(0.0, 0.7))
+    config = TrainingConfig(shape="sandwich", theta="diagonal", mean_weight=0.0, max_iterations=1)
+    model = train(examples, config).model
+    Ad = adjoint(exp([0, 0, 0, 0, 0, 0.7]))
+    for k in range(6):
+        turned_S = Ad @ examples.shapes["sandwich"][k] @ Ad.T
+        root = matrix_sqrt(turned_S)
+        np.testing.assert_allclose(
+            root @ model.covariances[2 * k + 1] @ root,
+            Ad @ examples.covariances[k] @ Ad.T,
+            rtol=1e-8,
+            atol=1e-12,
+        )
+
+
+def test_constant_features_weigh_nothing() -> None:
+    examples = some(n_features=6)
+    features = examples.features.copy()
+    features[:, :, 2] = 0.1
+    config = TrainingConfig(shape="none", theta="low_rank", rank=3, max_iterations=3)
+    model = train(dataclasses.replace(examples, features=features), config).model
+    assert model.scale[2] == 1.0
+    assert not model.theta[:, 2].any()
+
+
+def test_training_twice_gives_the_same_bits() -> None:
+    config = TrainingConfig(shape="none", theta="low_rank", rank=2, max_iterations=15)
+    one, two = train(some(), config).model, train(some(), config).model
+    for name in ("theta", "mean", "scale", "projections", "covariances"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert one.provenance == two.provenance
+
+
+def test_the_order_of_the_examples_does_not_change_predictions() -> None:
+    examples = some()
+    order = np.random.default_rng(0).permutation(24)
+    shuffled = dataclasses.replace(
+        examples,
+        features=examples.features[order],
+        covariances=examples.covariances[order],
+        groups=examples.groups[order],
+        xi=tuple(examples.xi[k] for k in order),
+    )
+    config = dataclasses.replace(PAPER, max_iterations=3)  # rounding grows from step to step
+    one, two = train(examples, config).model, train(shuffled, config).model
+    d = np.linspace(-1, 1, 5)
+    np.testing.assert_allclose(predict(one, d).covariance, predict(two, d).covariance, rtol=1e-6)
+
+
+def test_an_interrupt_keeps_the_best_so_far() -> None:
+    def interrupt(iteration: int, training: float, validation: float) -> None:
+        if iteration == 2:
+            raise KeyboardInterrupt
+
+    training = train(planted(120), PAPER, planted(60, 1), interrupt)
+    whole = train(planted(120), PAPER, planted(60, 1))
+    assert training.interrupted
+    assert not whole.interrupted
+    assert training.n_iterations == 2 < whole.n_iterations
+    kl_of = [t.figures["validation"]["model"]["kl_mean"] for t in (whole, training)]
+    assert kl_of[0] < kl_of[1] < training.figures["validation"]["mean_covariance"]["kl_mean"]
+
+
+def test_the_best_theta_by_validation_is_kept() -> None:
+    seen: list[tuple[float, int]] = []
+
+    def record(iteration: int, training: float, validation: float) -> None:
+        seen.append((validation, iteration))
+
+    config = dataclasses.replace(PAPER, theta="upper_triangular", regularization=0.0)
+    training = train(noise(60, 5), config, noise(60, 6), record)
+    best = min(seen)
+    assert training.n_iterations == seen[-1][1] <= training.best_iteration + 20
+    assert training.best_iteration in (best[1], 0)
+    figures = training.figures["validation"]
+    assert figures["model"]["kl_mean"] <= figures["mean_covariance"]["kl_mean"] * (1 + 1e-9)
+
+
+def test_figures_say_both_how_far_and_in_which_direction() -> None:
+    rng = np.random.default_rng(0)
+    Y = covariances(1, rng)[0]
+    examples = dataclasses.replace(
+        some(60),
+        covariances=np.tile(Y, (60, 1, 1)),
+        xi=tuple(rng.multivariate_normal(np.zeros(6), 4 * Y, size=50) for _ in range(60)),
+    )
+    figures = train(examples, PAPER).figures["leave_recording_out"]
+    assert set(figures) == {"model", "mean_covariance", "constant_relative"}
+    # all pairs have the same covariance, and the sampled errors are twice as large
+    assert figures["model"]["kl_mean"] == pytest.approx(0.0, abs=1e-9)
+    assert figures["model"]["mahalanobis2_over_6"] == pytest.approx(1.0)
+    inside = np.mean(rng.chisquare(6, 100000) < 12.5916 / 4)
+    assert figures["model"]["coverage_95"] == pytest.approx(inside, abs=0.03)
+    smaller = dataclasses.replace(examples, covariances=np.tile(Y, (60, 1, 1)))
+    smaller.covariances[examples.groups == "world_s0"] /= 10
+    figures = train(smaller, PAPER).figures["leave_recording_out"]
+    assert figures["mean_covariance"]["mahalanobis2_over_6"] == pytest.approx((0.1 + 2 / 0.55) / 3)
+    wide, narrow = (float(kl(np.eye(6), size * np.eye(6))) for size in (0.55, 10.0))
+    assert figures["mean_covariance"]["kl_mean"] == pytest.approx((2 * wide + narrow) / 3)
+    assert figures["mean_covariance"]["kl_median"] == pytest.approx(wide)
+    assert figures["mean_covariance"]["kl_trimmed_mean"] == pytest.approx(
+        (40 * wide + 14 * narrow) / 54
+    )
+    assert figures["constant_relative"] == figures["mean_covariance"]  # the shape is none
+
+
+def test_one_recording_is_too_few() -> None:
+    examples = dataclasses.replace(some(), groups=np.array(["alone"] * 24))
+    with pytest.raises(DatasetError, match=r"at least two recordings.*found only alone"):
+        train(examples, PAPER)
+
+
+def test_a_recording_cannot_be_validated_on_and_trained_on() -> None:
+    with pytest.raises(DatasetError, match="world_s0 is both trained on and validated on"):
+        train(some(), PAPER, some(3))
+
+
+def test_a_missing_shape_is_named() -> None:
+    with pytest.raises(DatasetError, match="does not hold the sandwich"):
+        train(dataclasses.replace(some(), shapes={}), TrainingConfig(shape="sandwich"))
+
+
+def filled(path: Path, names: tuple[str, ...], **settings: object) -> Dataset:
+    sampling = SamplingConfig(**settings)  # type: ignore[arg-type]
+    dataset = open_dataset(path, Pipeline(), sampling, create=True)
+    rng = np.random.default_rng(len(path.name))
+    for name in names:
+        for i in range(4):
+            dataset.write(
+                PairRecord(
+                    recording=name,
+                    i=i,
+                    j=i + 1,
+                    accepted=i < 3,
+                    reason="" if i < 3 else "offset",
+                    T_mean=np.eye(4),
+                    xi=rng.normal(size=(500, 6)),
+                    kept=np.arange(500) < 450,
+                    covariance=covariances(1, rng)[0],
+                    descriptors=rng.random((2, 11), dtype=np.float32),
+                    rotations_rad=np.array([0.0, np.pi / 2]),
+                    shapes={"sandwich": covariances(1, rng)[0]},
+                )
+            )
+    return dataset
+
+
+def test_examples_are_the_accepted_pairs_of_the_named_recordings(tmp_path: Path) -> None:
+    one, two = filled(tmp_path / "one", ("a", "b")), filled(tmp_path / "two", ("c",), seed=7)
+    examples = load_examples([one, two], ["a", "c"])
+    assert examples.n_pairs == {"a": 3, "c": 3}
+    assert examples.rejected == {"offset": 2}
+    assert examples.features.shape == (6, 2, 11)
+    np.testing.assert_array_equal(examples.covariances[1], one.read("a", 1, 2).covariance)
+    np.testing.assert_array_equal(
+        examples.shapes["sandwich"][3], two.read("c", 0, 1).shapes["sandwich"]
+    )
+    record = one.read("a", 0, 1)
+    assert 100 <= len(examples.xi[0]) <= 200
+    assert set(examples.xi[0][:, 0]) <= set(record.xi[record.kept, 0])
+
+
+def test_datasets_of_different_settings_do_not_mix(tmp_path: Path) -> None:
+    one = filled(tmp_path / "one", ("a",))
+    two = filled(tmp_path / "two", ("b",), variance=0.1)
+    with pytest.raises(DatasetError, match=r"sampling.variance is 0.1, not 0.05"):
+        load_examples([one, two], ["a", "b"])
+    pipeline = Pipeline(cloud=CloudConfig(voxel_m=0.3))
+    three = open_dataset(tmp_path / "three", pipeline, SamplingConfig(), create=True)
+    with pytest.raises(DatasetError, match=r"cloud.voxel_m is 0.3, not 0.2"):
+        load_examples([one, three], ["a"])
+
+
+def test_a_pair_in_two_datasets_is_refused(tmp_path: Path) -> None:
+    one, two = filled(tmp_path / "one", ("a",)), filled(tmp_path / "two", ("a",))
+    with pytest.raises(DatasetError, match="repeats the pair"):
+        load_examples([one, two], ["a"])
+
+
+def test_a_damaged_pair_stops_training_with_its_name(tmp_path: Path) -> None:
+    one = filled(tmp_path / "one", ("a",))
+    (tmp_path / "one" / "pairs" / "a_1_2.npz").write_bytes(b"PK\x03\x04 half")
+    with pytest.raises(DatasetError, match=r"a_1_2.npz is damaged"):
+        load_examples([one], ["a"])
+
+
+def test_no_accepted_pair_is_said(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="no accepted pair"):
+        load_examples([filled(tmp_path / "one", ("a",))], ["nobody"])
