@@ -169,11 +169,11 @@ def nearest_one(
     distances2: Array,
     indices: Indices,
     stack: Array,
-) -> None:
-    """Fill the neighbours of one query whose squared distance is below ``bound2``, closest first.
+) -> int:
+    """Fill the neighbours of one query that are nearer than ``bound2``, squared; count them.
 
-    distances2, indices: (k,); infinite and -1 where fewer are found.  stack: (64, 2) scratch of
-    (node, squared distance of its box).
+    distances2, indices: (k,), closest first; infinite and -1 where fewer are found.  stack:
+    (64, 2) scratch of (node, squared distance of its box).
     """
     points, _, boxes, leaves = tree
     k = len(distances2)
@@ -181,7 +181,7 @@ def nearest_one(
     indices[:] = -1
     worst = bound2
     n_inner = len(leaves) - 2
-    top = 0
+    top = n_found = 0
     node = 0
     node2 = _box_distance2(boxes[0], x, y, z)
     while True:
@@ -204,6 +204,7 @@ def nearest_one(
                 dz = points[p, 2] - z
                 d2 = dx * dx + dy * dy + dz * dz
                 if d2 < worst:
+                    n_found = min(n_found + 1, k)
                     j = k - 1
                     while j > 0 and distances2[j - 1] > d2:
                         distances2[j] = distances2[j - 1]
@@ -213,7 +214,7 @@ def nearest_one(
                     indices[j] = p
                     worst = min(worst, distances2[k - 1])
         if top == 0:
-            return
+            return n_found
         top -= 1
         node = int(stack[top, 0])
         node2 = stack[top, 1]
@@ -237,5 +238,4 @@ def _any_within_many(
     bound2 = np.nextafter(radius2, np.inf)  # a point at the radius itself is within
     for q in range(len(queries)):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        nearest_one(tree, x, y, z, bound2, distance2, index, stack)
-        found[q] = index[0] >= 0
+        found[q] = nearest_one(tree, x, y, z, bound2, distance2, index, stack) > 0

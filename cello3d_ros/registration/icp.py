@@ -30,6 +30,7 @@ from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import Array
 
 REASONS = ("", "max_iterations", "singular", "too_few_points")
+_SLACK = 1.2  # search beyond the last trim limit, in squared distance
 _CONVERGED, _MAX_ITERATIONS, _SINGULAR, _TOO_FEW_POINTS = range(4)
 
 
@@ -144,11 +145,10 @@ def _icp(
     indices = np.full((n, k), -1)
     rotation_steps = np.zeros(max_iterations)
     translation_steps = np.zeros(max_iterations)
-    rms, n_kept = np.nan, 0
+    rms, n_kept, limit = np.nan, 0, np.inf
     for iteration in range(max_iterations):
         moved = start @ R.T + t
-        _associate(moved, tree, distances2, indices)
-        limit = _trim_limit(distances2, trim_ratio)
+        limit = _associate(moved, tree, trim_ratio, limit, distances2, indices)
         if to_plane:
             ok, dR, dt, rms, n_kept = _plane_step(
                 moved, tree.points, normals, distances2, indices, limit
@@ -174,8 +174,32 @@ def _icp(
 
 
 @njit(cache=True, nogil=True)
-def _associate(moved: Array, tree: KdTree, distances2: Array, indices: Indices) -> None:
-    """Fill the k nearest neighbours of each point.
+def _associate(
+    moved: Array,
+    tree: KdTree,
+    trim_ratio: float,
+    last_limit: float,
+    distances2: Array,
+    indices: Indices,
+) -> float:
+    """Fill the neighbours of each point up to the trim limit, and return that limit.
+
+    The limit is the squared distance of rank ``int(k N trim_ratio)``.  Associations beyond it are
+    dropped, so they are not searched for: the search stops a little beyond the last limit and
+    leaves them infinite.  When enough are found, the found ones are the smallest of all, and the
+    rank among them is exact; when not, the search is done again without that bound.
+    """
+    rank = min(int(distances2.size * trim_ratio), distances2.size - 1)
+    if _search(moved, tree, _SLACK * last_limit, distances2, indices) <= rank:
+        _search(moved, tree, np.inf, distances2, indices)
+    return float(np.partition(distances2.ravel(), rank)[rank])
+
+
+@njit(cache=True, nogil=True)
+def _search(
+    moved: Array, tree: KdTree, cap2: float, distances2: Array, indices: Indices
+) -> int:
+    """Fill the k nearest neighbours whose squared distance is below ``cap2``; count them.
 
     The neighbours of the step before are as good a set of k points as any: the k-th neighbour
     cannot be farther than the farthest of them is now, so the search starts from that bound.
@@ -183,25 +207,19 @@ def _associate(moved: Array, tree: KdTree, distances2: Array, indices: Indices) 
     k = indices.shape[1]
     stack = np.empty((64, 2))
     points = tree.points
+    n_found = 0
     for i in range(len(moved)):
         x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
-        bound2 = np.inf
-        if indices[i, 0] >= 0:
-            bound2 = 0.0
+        bound2 = cap2
+        if indices[i, k - 1] >= 0:
+            farthest2 = 0.0
             for j in range(k):
                 p = indices[i, j]
                 dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
-                bound2 = max(bound2, dx * dx + dy * dy + dz * dz)
-            bound2 = np.nextafter(bound2, np.inf)
-        nearest_one(tree, x, y, z, bound2, distances2[i], indices[i], stack)
-
-
-@njit(cache=True, nogil=True)
-def _trim_limit(distances2: Array, ratio: float) -> float:
-    """Return the squared distance of rank ``int(size * ratio)``, the last for a ratio of 1."""
-    flat = distances2.ravel()
-    rank = min(int(len(flat) * ratio), len(flat) - 1)
-    return float(np.partition(flat, rank)[rank])
+                farthest2 = max(farthest2, dx * dx + dy * dy + dz * dz)
+            bound2 = min(bound2, np.nextafter(farthest2, np.inf))
+        n_found += nearest_one(tree, x, y, z, bound2, distances2[i], indices[i], stack)
+    return n_found
 
 
 @njit(cache=True, nogil=True)

@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from cello3d_ros.clouds.neighbors import any_within, build_tree, nearest
+
+CASES = {
+    "normal": lambda rng: rng.normal(size=(2000, 3)),
+    "plane": lambda rng: rng.uniform(-5, 5, (2000, 3)) * [1, 1, 0],
+    "line": lambda rng: rng.uniform(-5, 5, (500, 1)) * [1.0, 2.0, 3.0],
+    "lattice full of ties": lambda rng: rng.integers(0, 6, (3000, 3)).astype(float),
+    "all the same": lambda rng: np.ones((100, 3)),
+    "fewer than a leaf": lambda rng: rng.normal(size=(5, 3)),
+    "one": lambda rng: rng.normal(size=(1, 3)),
+    "far from the origin": lambda rng: rng.normal(size=(1000, 3)) + 1e6,
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("k", [1, 3, 20])
+def test_neighbors_are_those_of_an_independent_tree(case, k):
+    rng = np.random.default_rng(7)
+    points = CASES[case](rng)
+    queries = np.vstack([points[:200], points.mean(axis=0) + 3 * rng.normal(size=(300, 3))])
+    tree = build_tree(points)
+    assert sorted(tree.order) == list(range(len(points)))
+    np.testing.assert_array_equal(tree.points, points[tree.order])
+    distances2, indices = nearest(tree, queries, k)
+    expected = cKDTree(points).query(queries, k=[*range(1, k + 1)])[0]
+    np.testing.assert_allclose(np.sqrt(distances2), expected, rtol=1e-12)
+    found = indices >= 0
+    assert (found.sum(axis=1) == min(k, len(points))).all()
+    to_found = np.linalg.norm(queries[:, None] - tree.points[indices], axis=2)
+    np.testing.assert_allclose(to_found[found], np.sqrt(distances2[found]), rtol=1e-12)
+    assert all(len(set(row[row >= 0])) == (row >= 0).sum() for row in indices)
+
+
+def test_many_queries_in_threads_are_answered_as_one_by_one():
+    rng = np.random.default_rng(8)
+    tree = build_tree(rng.normal(size=(3000, 3)))
+    queries = rng.normal(size=(10000, 3))
+    together = nearest(tree, queries, 3)
+    apart = [nearest(tree, queries[part], 3) for part in (slice(0, 17), slice(17, None))]
+    np.testing.assert_array_equal(together[0], np.vstack([a[0] for a in apart]))
+    np.testing.assert_array_equal(together[1], np.vstack([a[1] for a in apart]))
+
+
+def test_within_means_at_most_the_radius():
+    tree = build_tree(np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]]))
+    queries = np.array([[0.5, 0.0, 0.0], [0.5000001, 0.0, 0.0], [10.0, 0.3, 0.4], [5.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(any_within(tree, queries, 0.5), [True, False, True, False])
+
+
+def test_a_tree_of_nothing_is_refused():
+    with pytest.raises(ValueError, match="at least one point"):
+        build_tree(np.empty((0, 3)))

@@ -1,0 +1,115 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cello3d_ros.clouds.pointcloud2 import read_fields, read_points
+from cello3d_ros.errors import CloudError
+
+NUMBERS = {"f4": 7, "f8": 8, "u2": 4, "u1": 2}
+
+
+def message(points, layout, *, big=False, height=1, padding=0, extra=b""):
+    """Build a PointCloud2-like message; layout is a list of (name, type, offset), point_step last."""
+    *fields, step = layout
+    order = ">" if big else "<"
+    dtype = np.dtype(
+        {
+            "names": [name for name, _, _ in fields],
+            "formats": [order + kind for _, kind, _ in fields],
+            "offsets": [offset for _, _, offset in fields],
+            "itemsize": step,
+        }
+    )
+    records = np.zeros(len(points), dtype)
+    for name in dtype.names:
+        column = {"x": 0, "y": 1, "z": 2, "intensity": 3}[name]
+        records[name] = points[:, column]
+    width = len(points) // height
+    rows = records.view(np.uint8).reshape(height, width * step)
+    data = np.hstack([rows, np.full((height, padding), 0xAB, np.uint8)]).tobytes() + extra
+    return SimpleNamespace(
+        width=width,
+        height=height,
+        point_step=step,
+        row_step=width * step + padding,
+        is_bigendian=big,
+        is_dense=True,
+        data=data,
+        fields=[
+            SimpleNamespace(name=name, offset=offset, datatype=NUMBERS[kind], count=1)
+            for name, kind, offset in fields
+        ],
+    )
+
+
+PLAIN = [("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), 12]
+DOUBLE = [("x", "f8", 0), ("y", "f8", 8), ("z", "f8", 16), 24]
+SHUFFLED = [("intensity", "u2", 2), ("z", "f4", 20), ("x", "f8", 4), ("y", "f4", 12), 32]
+
+
+@pytest.fixture
+def points():
+    values = np.random.default_rng(3).integers(-999, 999, (60, 4)) / 8.0  # exact in float32
+    values[:, 3] = np.arange(60)
+    return values
+
+
+@pytest.mark.parametrize("layout", [PLAIN, DOUBLE, SHUFFLED], ids=["f4", "f8", "shuffled"])
+@pytest.mark.parametrize("big", [False, True], ids=["little", "big"])
+@pytest.mark.parametrize(("height", "padding"), [(1, 0), (6, 0), (6, 7)])
+def test_every_layout_gives_the_same_points(points, layout, big, height, padding):
+    found = read_points(message(points, layout, big=big, height=height, padding=padding))
+    assert found.dtype == np.float64
+    np.testing.assert_array_equal(found, points[:, :3])
+
+
+def test_the_last_row_may_come_without_its_padding(points):
+    cloud = message(points, PLAIN, height=6, padding=5)
+    cloud.data = cloud.data[:-5]
+    np.testing.assert_array_equal(read_points(cloud), points[:, :3])
+
+
+def test_rows_of_no_position_take_their_companions_along(points):
+    points[[0, 7], 0] = np.nan
+    points[8, 2] = -np.inf
+    fields = read_fields(message(points, SHUFFLED), ("intensity", "x"))
+    expected = np.delete(np.arange(60), [0, 7, 8])
+    np.testing.assert_array_equal(fields["intensity"], expected)
+    np.testing.assert_array_equal(fields["x"], points[expected, 0])
+
+
+def test_the_points_are_not_a_view_of_the_message(points):
+    cloud = message(points, DOUBLE)
+    cloud.data = bytearray(cloud.data)
+    found = read_points(cloud)
+    cloud.data[:] = bytes(len(cloud.data))
+    np.testing.assert_array_equal(found, points[:, :3])
+
+
+def test_an_empty_cloud_has_no_points():
+    assert read_points(message(np.zeros((0, 4)), PLAIN)).shape == (0, 3)
+
+
+def test_trailing_bytes_are_ignored(points):
+    assert len(read_points(message(points, PLAIN, extra=b"abc"))) == 60
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda m: setattr(m, "data", m.data[:-1]), "declares 720 bytes but holds 719"),
+        (lambda m: m.fields.pop(1), "no field 'y'"),
+        (lambda m: m.fields.clear(), "it has none"),
+        (lambda m: setattr(m.fields[0], "datatype", 77), "unknown datatype 77"),
+        (lambda m: setattr(m.fields[2], "datatype", 6), "expected a float"),
+        (lambda m: setattr(m.fields[0], "offset", 9), "beyond point_step 12"),
+        (lambda m: setattr(m, "point_step", 0), "beyond point_step 0"),
+        (lambda m: setattr(m, "row_step", 12), "row_step 12 is less than width"),
+    ],
+)
+def test_a_message_that_contradicts_itself_is_refused(points, change, words):
+    cloud = message(points, PLAIN)
+    change(cloud)
+    with pytest.raises(CloudError, match=words):
+        read_points(cloud)
