@@ -1,0 +1,156 @@
+"""``cello3d train``: what enters training, what is written, what is refused."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cello3d_ros.cli import train as verb
+from cello3d_ros.config import Pipeline, SamplingConfig
+from cello3d_ros.covariance.model import load_model
+from cello3d_ros.errors import Cello3dError, DatasetError
+from cello3d_ros.learning.dataset import PairRecord, open_dataset
+from cello3d_ros.learning.training import load_examples
+
+
+def fill(path: Path, names: list[str], seed: int = 0, **settings: object) -> Path:
+    sampling = SamplingConfig(**settings)  # type: ignore[arg-type]
+    dataset = open_dataset(path, Pipeline(), sampling, create=True)
+    for name in names:
+        rng = np.random.default_rng([seed, *name.encode()])
+        for i in range(6):
+            xi = rng.normal(size=(40, 6)) * 0.01
+            dataset.write(
+                PairRecord(
+                    recording=name,
+                    i=i,
+                    j=i + 1,
+                    accepted=i > 0,
+                    reason="" if i > 0 else "offset",
+                    T_mean=np.eye(4),
+                    xi=xi,
+                    kept=np.ones(40, np.bool_),
+                    covariance=xi.T @ xi / 39,
+                    descriptors=rng.random((2, 22), dtype=np.float32),
+                    rotations_rad=np.array([0.0, np.pi / 2]),
+                    shapes={"sandwich": np.eye(6) * 1e-4, "hessian": np.eye(6) * 1e-6},
+                )
+            )
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return fill(tmp_path / "set", ["hall_s0", "hall_s1", "hall_s3", "wood_s0", "wood_s3"])
+
+
+def cello3d_train(*words: object) -> None:
+    parser = argparse.ArgumentParser()
+    verb.add_arguments(parser)
+    verb.run(parser.parse_args([str(word) for word in words]))
+
+
+def test_a_model_with_its_provenance_and_a_table_come_out(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "model.npz"
+    cello3d_train(folder, "--out", out, "--validation", "*_s3")
+    model = load_model(out)
+    assert model.n_examples == 3 * 5 * 2
+    assert model.shape == "sandwich"
+    assert model.provenance["recordings"] == {"hall_s0": 5, "hall_s1": 5, "wood_s0": 5}
+    assert model.provenance["validation_recordings"] == {"hall_s3": 5, "wood_s3": 5}
+    assert model.provenance["rejected_pairs"] == {"offset": 3}
+    assert model.provenance["training"]["seed"] == 0
+    assert model.provenance["versions"]["numpy"] == np.__version__
+    printed = capsys.readouterr().out
+    assert "15 pairs of 3 recordings" in printed
+    assert "validation (10 pairs)" in printed
+    for row in ("model", "mean covariance", "constant relative"):
+        assert f"\n  {row} " in printed
+    figures = model.provenance["figures"]["validation"]["model"]
+    assert f"{figures['kl_mean']:.4g}" in printed
+
+
+def test_validation_and_excluded_recordings_never_enter_training(
+    folder: Path, tmp_path: Path
+) -> None:
+    outs = [tmp_path / "one.npz", tmp_path / "two.npz"]
+    words = ("--validation", "hall_s3", "--exclude", "wood_*", "--config", tmp_path / "c.yaml")
+    (tmp_path / "c.yaml").write_text("training: {max_iterations: 3}")
+    cello3d_train(folder, "--out", outs[0], *words)
+    model = load_model(outs[0])
+    dataset = open_dataset(folder)
+    seen = load_examples([dataset], ["hall_s0", "hall_s1"])
+    np.testing.assert_array_equal(model.mean, seen.features.astype(float).mean(axis=(0, 1)))
+    assert model.n_examples == 2 * 5 * 2
+    for name in ("hall_s3", "wood_s0", "wood_s3"):
+        for i in range(1, 6):  # gone from the folder: training must not notice
+            (folder / "pairs" / f"{name}_{i}_{i + 1}.npz").unlink()
+    fill(folder, ["hall_s3", "wood_s0", "wood_s3"], seed=9)
+    cello3d_train(folder, "--out", outs[1], *words)
+    again = load_model(outs[1])
+    for name in ("mean", "scale", "covariances"):
+        np.testing.assert_array_equal(getattr(model, name), getattr(again, name))
+
+
+def test_a_dataset_folder_may_be_what_is_validated_on(folder: Path, tmp_path: Path) -> None:
+    other = fill(tmp_path / "other", ["stairs", "garden"])
+    out = tmp_path / "model.npz"
+    cello3d_train(folder, "--out", out, "--validation", other, "--theta", "diagonal")
+    provenance = load_model(out).provenance
+    assert sorted(provenance["validation_recordings"]) == ["garden", "stairs"]
+    assert len(provenance["recordings"]) == 5
+    assert provenance["training"]["theta"] == "diagonal"
+
+
+def test_overrides_win_over_the_file(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text("training: {shape: hessian, max_iterations: 2, seed: 5}")
+    out = tmp_path / "model.npz"
+    cello3d_train(folder, "--out", out, "--config", tmp_path / "c.yaml", "--shape", "none")
+    model = load_model(out)
+    assert model.shape == "none"
+    assert model.provenance["training"]["seed"] == 5
+    assert model.provenance["iterations"] <= 2
+
+
+def test_a_pattern_that_matches_nothing_is_refused(folder: Path, tmp_path: Path) -> None:
+    for option in ("--validation", "--exclude"):
+        with pytest.raises(DatasetError, match=r"no recording matches 'hal_s3'.*hall_s0"):
+            cello3d_train(folder, "--out", tmp_path / "model.npz", option, "hal_s3")
+    assert not (tmp_path / "model.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("validation", "exclude", "training"),
+    [
+        ([], [], ["a_s0", "a_s1", "b_s0"]),
+        (["*_s1"], [], ["a_s0", "b_s0"]),
+        (["a_*"], ["a_s1"], ["b_s0"]),
+        (["b_s0"], ["b_*"], ["a_s0", "a_s1"]),
+    ],
+)
+def test_split(validation: list[str], exclude: list[str], training: list[str]) -> None:
+    split = verb.split_recordings(["b_s0", "a_s1", "a_s0"], validation, exclude)
+    assert split.training == training
+    assert not set(split.validation) & set(split.training)
+
+
+def test_nothing_left_to_train_on_is_said() -> None:
+    with pytest.raises(DatasetError, match="no recording is left"):
+        verb.split_recordings(["a", "b"], ["*"], [])
+
+
+def test_where_the_model_cannot_go_is_said_before_training(folder: Path, tmp_path: Path) -> None:
+    for out in (tmp_path / "missing" / "model.npz", tmp_path):
+        with pytest.raises(Cello3dError, match="cannot write the model"):
+            cello3d_train(folder, "--out", out)
+
+
+def test_datasets_that_do_not_mix_are_refused(folder: Path, tmp_path: Path) -> None:
+    other = fill(tmp_path / "other", ["stairs"], variance=0.2)
+    with pytest.raises(DatasetError, match=r"sampling.variance is 0.2, not 0.05"):
+        cello3d_train(folder, other, "--out", tmp_path / "model.npz")
