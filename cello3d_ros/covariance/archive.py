@@ -6,6 +6,7 @@ header declare is compared with each other and with a bound before anything is a
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import tokenize
@@ -106,6 +107,8 @@ def _item(
     archive: zipfile.ZipFile, entry: zipfile.ZipInfo, dtype: np.dtype[Any], path: Path | str
 ) -> NDArray[Any]:
     where = f"{path}: item {entry.filename[:-4]!r}"
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ModelError(f"{where} is compressed by method {entry.compress_type}, not deflate")
     try:
         with archive.open(entry) as stream:
             if (version := np.lib.format.read_magic(stream)) != (1, 0):
@@ -113,7 +116,7 @@ def _item(
             shape, fortran, found = np.lib.format.read_array_header_1_0(stream)
             n_bytes = entry.file_size - stream.tell()
             _check(where, shape, fortran, found, dtype, n_bytes)
-            # read() without a count would inflate whatever the stream holds
+            # without a count, read() would inflate whatever the stream holds
             return np.frombuffer(stream.read(n_bytes), dtype).reshape(shape)
     except _DAMAGE as error:
         raise ModelError(f"{where} is damaged: {error}") from None
@@ -129,8 +132,7 @@ def _check(
 ) -> None:
     if found != dtype:
         raise ModelError(f"{where} has dtype {found}, not {dtype}")
-    declared = dtype.itemsize
-    for extent in shape:
-        declared *= max(extent, -1)
-    if declared != n_bytes or min(shape, default=0) < 0 or (fortran and len(shape) > 1):
+    if math.prod(shape) * dtype.itemsize != n_bytes:
         raise ModelError(f"{where} has shape {shape}, which does not fit its {n_bytes} bytes")
+    if fortran and len(shape) > 1:
+        raise ModelError(f"{where} is stored column by column")

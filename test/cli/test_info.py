@@ -41,11 +41,15 @@ def test_a_table_shows_provenance_pipeline_and_sizes(
     info.run(parsed(str(a_model_file(tmp_path))))
     lines = capsys.readouterr().out.splitlines()
     rows = {line.split()[0]: line.split(maxsplit=1)[1:] for line in lines if line.strip()}
-    assert rows["n_examples"] == ["1"] and rows["n_features"] == ["704"]
-    assert rows["cutoff_rho"] == ["none"] and rows["relative_to"] == ["none"]
+    assert rows["n_examples"] == ["1"]
+    assert rows["n_features"] == ["704"]
+    assert rows["cutoff_rho"] == ["none"]
+    assert rows["relative_to"] == ["none"]
     assert rows["mean_sigmas_m"] == ["0.02, 0.02, 0.02"]
-    assert rows["recordings"] == ["rooms-0, wood-1"] and rows["kl_mean"] == ["1.25"]
-    assert rows["trim_ratio"] == ["0.7"] and rows["variance"] == ["0.05"]
+    assert rows["recordings"] == ["rooms-0, wood-1"]
+    assert rows["kl_mean"] == ["1.25"]
+    assert rows["trim_ratio"] == ["0.7"]
+    assert rows["variance"] == ["0.05"]
     assert {"provenance", "pipeline", "sampling"} <= set(lines)
     assert not any(line != line.rstrip() for line in lines)
 
@@ -57,12 +61,16 @@ def test_json_holds_the_same_for_a_machine(
     info.run(parsed(str(path), "--json"))
     found = json.loads(capsys.readouterr().out)
     config = config_to(Config())
-    assert found["path"] == str(path) and found["relative_to"] == "sandwich"
-    assert found["kind"] == "model file (.npz)" and found["format_version"] == 1
+    assert found["path"] == str(path)
+    assert found["relative_to"] == "sandwich"
+    assert found["kind"] == "model file (.npz)"
+    assert found["format_version"] == 1
     assert found["size_bytes"] == path.stat().st_size
-    assert found["provenance"] == PROVENANCE and found["sampling"] == config["sampling"]
+    assert found["provenance"] == PROVENANCE
+    assert found["sampling"] == config["sampling"]
     assert found["pipeline"] == {k: config[k] for k in ("cloud", "icp", "overlap", "grid")}
-    assert "mean_sigmas_relative" in found and "mean_sigmas_m" not in found
+    assert "mean_sigmas_relative" in found
+    assert "mean_sigmas_m" not in found
 
 
 def test_a_path_of_no_known_kind_is_an_error_that_names_the_kinds(tmp_path: Path) -> None:
