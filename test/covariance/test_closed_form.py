@@ -1,0 +1,153 @@
+import numpy as np
+import pytest
+
+from cello3d_ros.clouds.shape import prepare
+from cello3d_ros.config import CloudConfig, IcpConfig
+from cello3d_ros.covariance.closed_form import _normal_matrices, closed_form
+from cello3d_ros.errors import RegistrationError
+from cello3d_ros.geometry.se3 import exp, inverse, log, transform
+from cello3d_ros.registration.icp import icp
+
+
+def normal_matrix(points, normals):
+    """Return H for points that are associated with themselves."""
+    n = len(points)
+    zeros, own = np.zeros((n, 1)), np.arange(n)[:, None]
+    H, G = _normal_matrices(points, points, points, normals, np.eye(3), zeros, own, 1.0)
+    np.testing.assert_array_equal(G, 0.0)  # no residuals
+    return H
+
+
+def null_space(points, normals):
+    """Return the names of the free directions, which must be along the axes."""
+    values, vectors = np.linalg.eigh(normal_matrix(points, normals))
+    free = vectors[:, values < 1e-9 * values[-1]]
+    names = np.array(["tx", "ty", "tz", "rx", "ry", "rz"])
+    share = (free**2).sum(axis=1)
+    np.testing.assert_allclose(share[share > 0.5].sum(), free.shape[1], atol=1e-6)
+    return set(names[share > 0.5])
+
+
+def plane(rng, axis, at=0.0, n=400):
+    points = rng.uniform(-2, 2, (n, 3))
+    points[:, axis] = at
+    return points, np.tile(np.eye(3)[axis], (n, 1))
+
+
+def join(*parts):
+    return np.vstack([p for p, _ in parts]), np.vstack([n for _, n in parts])
+
+
+def cylinder(rng, n=800):
+    angle, z = rng.uniform(0, 2 * np.pi, n), rng.uniform(-2, 2, n)
+    radial = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=1)
+    return radial + z[:, None] * [0, 0, 1], radial
+
+
+def disc(rng, z):
+    points, normals = plane(rng, 2, z)
+    inside = np.linalg.norm(points[:, :2], axis=1) < 1
+    return points[inside], normals[inside]
+
+
+def sphere(rng):
+    radial = rng.normal(size=(800, 3))
+    radial /= np.linalg.norm(radial, axis=1, keepdims=True)
+    return radial, radial
+
+
+def cube(rng, n):
+    return join(*(plane_of_cube(rng, axis, sign, n) for axis in range(3) for sign in (-1, 1)))
+
+
+def plane_of_cube(rng, axis, sign, n):
+    points = rng.uniform(-0.5, 0.5, (n, 3))
+    points[:, axis] = 0.5 * sign
+    return points, np.tile(sign * np.eye(3)[axis], (n, 1))
+
+
+SCENES = {
+    "plane": (lambda r: plane(r, 2), {"tx", "ty", "rz"}),
+    "two parallel walls": (lambda r: join(plane(r, 1, -1), plane(r, 1, 1)), {"tx", "tz", "ry"}),
+    "ground and wall": (lambda r: join(plane(r, 2, -2), plane(r, 0, 2)), {"ty"}),
+    "hallway": (
+        lambda r: join(*(plane(r, a, s) for a in (1, 2) for s in (-2, 2))),
+        {"tx"},
+    ),
+    "cylinder": (cylinder, {"tz", "rz"}),
+    "capped cylinder": (lambda r: join(cylinder(r), disc(r, 2.0), disc(r, -2.0)), {"rz"}),
+    "sphere": (sphere, {"rx", "ry", "rz"}),
+    "cube": (lambda r: cube(r, 200), set()),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_normal_matrix_is_free_where_the_scene_is(scene):
+    build, expected = SCENES[scene]
+    assert null_space(*build(np.random.default_rng(31))) == expected
+
+
+def test_a_unit_cube_has_the_eigenvalues_of_its_symmetry():
+    points, normals = cube(np.random.default_rng(32), 40000)
+    values = np.linalg.eigvalsh(normal_matrix(points, normals)) / len(points)
+    np.testing.assert_allclose(values, [1 / 18] * 3 + [1 / 3] * 3, rtol=0.01)
+
+
+@pytest.fixture
+def pair(room):
+    T = exp([0.4, -0.3, 0.05, 0.02, 0.05, 0.6])
+    rng = np.random.default_rng(33)
+    reading = prepare(transform(inverse(T), room[0]), CloudConfig(), rng)
+    return reading, prepare(room[1], CloudConfig(), rng), T
+
+
+def test_both_are_covariances_on_the_reading_side(pair):
+    """H^-1 against finite differences of the residuals under T exp(xi)."""
+    reading, reference, T = pair
+    every = IcpConfig(n_neighbors=1, trim_ratio=1.0, n_reading_points=10**6)
+    found = closed_form(reading, reference, T, every)
+    nearest = np.linalg.norm(
+        transform(T, reading.points)[:, None] - reference.points[None], axis=2
+    ).argmin(axis=1)
+
+    def residuals(xi):
+        moved = transform(T @ exp(xi), reading.points)
+        return np.einsum("ij,ij->i", moved - reference.points[nearest], reference.normals[nearest])
+
+    step = 1e-6
+    J = np.stack(
+        [(residuals(step * e) - residuals(-step * e)) / (2 * step) for e in np.eye(6)], axis=1
+    )
+    H = J.T @ J
+    g = J * residuals(np.zeros(6))[:, None]
+    np.testing.assert_allclose(found.hessian, np.linalg.inv(H), rtol=1e-4, atol=1e-12)
+    expected = np.linalg.inv(H) @ (g.T @ g) @ np.linalg.inv(H)
+    np.testing.assert_allclose(found.sandwich, expected, rtol=1e-4, atol=1e-12)
+
+
+def test_the_sandwich_has_the_size_of_what_redrawing_the_reading_does(pair):
+    reading, reference, T = pair
+    config = IcpConfig(n_neighbors=1, n_reading_points=800)
+    rng = np.random.default_rng(34)
+    results = [
+        icp(
+            reading.points[rng.choice(len(reading.points), 800, replace=False)],
+            reference.points,
+            reference.normals,
+            T,
+            config,
+        ).T_ref_read
+        for _ in range(150)
+    ]
+    xi = log(inverse(T) @ np.array(results))
+    sampled = np.cov(xi.T)
+    predicted = closed_form(reading, reference, T, config).sandwich
+    ratio = np.trace(np.linalg.solve(predicted, sampled)) / 6
+    assert 0.3 < ratio < 6  # first order, without reassociation
+
+
+def test_a_free_direction_is_an_error():
+    rng = np.random.default_rng(35)
+    ground = prepare(plane(rng, 2, -1.0, 3000)[0], CloudConfig(), rng)
+    with pytest.raises(RegistrationError, match="leaves a direction free"):
+        closed_form(ground, ground, np.eye(4), IcpConfig())

@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+
+from cello3d_ros.config import GridConfig
+from cello3d_ros.covariance.descriptor import BINS, N_CELL, describe_overlap, n_features
+
+GRID = GridConfig()
+QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.fixture
+def overlap():
+    rng = np.random.default_rng(21)
+    points = rng.uniform([-14, -14, -6], [14, 14, 6], (4000, 3))
+    points = points[(points[:, 0] < 3) | (points[:, 1] > 0)]  # leaves cells empty
+    normals = rng.normal(size=points.shape)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return points, normals, rng.uniform(size=len(points)), rng.uniform(size=len(points))
+
+
+def test_the_papers_grid_gives_704_values(overlap):
+    assert n_features(GRID) == 704
+    assert describe_overlap(*overlap, GRID).shape == (704,)
+
+
+def test_each_cell_says_what_a_loop_over_its_points_says(overlap):
+    points, normals, planarity, cylindricality = overlap
+    d = describe_overlap(*overlap, GRID).reshape(4, 4, 4, N_CELL)
+    for place in np.ndindex(4, 4, 4):
+        low = np.array([-12.5, -12.5, -5.0]) + np.array(place) * [6.25, 6.25, 2.5]
+        inside = ((points >= low) & (points < low + [6.25, 6.25, 2.5])).all(axis=1)
+        if not inside.any():
+            np.testing.assert_array_equal(d[place], 0.0)
+            continue
+        assert d[place][0] == pytest.approx(planarity[inside].mean())
+        assert d[place][1] == pytest.approx(cylindricality[inside].mean())
+        angles = np.arccos(np.clip(np.abs(normals[inside] @ BINS.T), 0, 1))
+        shares = np.bincount(angles.argmin(axis=1), minlength=9) / inside.sum()
+        np.testing.assert_allclose(d[place][2:], shares)
+        assert d[place][2:].sum() == pytest.approx(1.0)
+
+
+def test_a_normal_and_its_opposite_are_the_same(overlap):
+    points, normals, planarity, cylindricality = overlap
+    flipped = describe_overlap(points, -normals, planarity, cylindricality, GRID)
+    np.testing.assert_array_equal(flipped, describe_overlap(*overlap, GRID))
+
+
+def test_a_quarter_turn_permutes_cells_and_bins(overlap):
+    points, normals, planarity, cylindricality = overlap
+    turned = describe_overlap(
+        points @ QUARTER.T, normals @ QUARTER.T, planarity, cylindricality, GRID
+    ).reshape(4, 4, 4, N_CELL)
+    plain = describe_overlap(*overlap, GRID).reshape(4, 4, 4, N_CELL)
+    moved = np.rot90(plain, axes=(0, 1))  # x -> y
+    # x <-> y; (1,1,0) <-> (-1,1,0); the diagonals follow each other round
+    bins = [1, 0, 3, 2, 4, 7, 5, 8, 6]
+    expected = np.concatenate([moved[..., :2], moved[..., 2:][..., bins]], axis=-1)
+    np.testing.assert_allclose(turned, expected, atol=1e-12)
+
+
+def test_the_bins_follow_a_quarter_turn_as_the_permutation_says():
+    bins = [1, 0, 3, 2, 4, 7, 5, 8, 6]
+    turned = np.abs((BINS @ QUARTER.T) @ BINS.T).argmax(axis=1)
+    assert [int(np.flatnonzero(turned == b)[0]) for b in range(9)] == bins
+
+
+def test_cells_are_half_open_and_outside_is_ignored():
+    up = np.array([[0.0, 0.0, 1.0]])
+    one = np.ones(1)
+
+    def cells(point):
+        d = describe_overlap(np.array([point]), up, one, one, GRID).reshape(4, 4, 4, N_CELL)
+        return np.argwhere(d[..., 0] > 0).tolist()
+
+    assert cells([0.0, 0.0, 0.0]) == [[2, 2, 2]]
+    assert cells([-1e-9, 0.0, 0.0]) == [[1, 2, 2]]
+    assert cells([-12.5, -12.5, -5.0]) == [[0, 0, 0]]
+    assert cells([12.5, 0.0, 0.0]) == []
+    assert cells([0.0, 0.0, 5.0]) == []
+
+
+def test_no_points_give_zeros():
+    empty = np.empty((0, 3))
+    np.testing.assert_array_equal(
+        describe_overlap(empty, empty, np.empty(0), np.empty(0), GRID), np.zeros(704)
+    )

@@ -1,0 +1,31 @@
+import numpy as np
+
+from cello3d_ros.clouds.shape import prepare
+from cello3d_ros.config import CloudConfig
+from cello3d_ros.geometry.se3 import exp, inverse, transform
+from cello3d_ros.registration.overlap import find_overlap
+
+CONFIG = CloudConfig(min_range_m=0.0, voxel_m=0.01, n_neighbors=3)
+
+
+def cloud(points):
+    return prepare(np.asarray(points, dtype=float), CONFIG, np.random.default_rng(0))
+
+
+def test_a_point_beyond_the_radius_is_outside():
+    near = cloud([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    far = cloud([[0, 0.2, 0], [1, 0.05, 0], [9, 0, 0]])
+    overlap = find_overlap(near, far, np.eye(4), 0.1)
+    assert near.points[overlap.reading].tolist() == [[1, 0, 0]]
+    assert far.points[overlap.reference].tolist() == [[1, 0.05, 0]]
+    assert overlap.n_points == 2
+    assert overlap.ratio == 1 / 3
+
+
+def test_overlap_does_not_depend_on_the_frames(room):
+    T = exp([0.5, -1.0, 0.2, 0.1, 0.2, 2.0])
+    reference = cloud(room[1][:2000])
+    here = find_overlap(cloud(room[0][:2000]), reference, np.eye(4), 0.2)
+    there = find_overlap(cloud(transform(inverse(T), room[0][:2000])), reference, T, 0.2)
+    assert abs(here.ratio - there.ratio) < 1e-3
+    assert abs(int(here.reference.sum()) - int(there.reference.sum())) <= 2
