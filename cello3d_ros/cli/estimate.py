@@ -62,7 +62,7 @@ def as_dict(estimate: Estimate) -> dict[str, Any]:
     T = registration.T_ref_read
     return {
         "T_ref_read": T.ravel().tolist(),
-        "covariance": to_fixed_axes(T, estimate.covariance).ravel().tolist(),
+        "covariance": to_fixed_axes(T[:3, :3], estimate.covariance).ravel().tolist(),
         "covariance_reading": estimate.covariance.ravel().tolist(),
         "overlap_ratio": estimate.overlap_ratio,
         "iterations": registration.n_iterations,

@@ -51,6 +51,18 @@ def to_right(T: ArrayLike, Y: ArrayLike) -> Array:
     return to_left(inverse(T), Y)
 
 
+def to_fixed_axes(R: ArrayLike, Y: ArrayLike) -> Array:
+    """Return ``blkdiag(R, R) Y blkdiag(R, R)^T``: what ROS calls the covariance of a pose.
+
+    That of the additive error of the position and of the rotation about fixed axes, both along
+    the axes of the frame in which the pose is given, to first order; neither the left nor the
+    right covariance.  R: (3, 3), rotation of the pose; Y: (6, 6), right.  ``to_fixed_axes(R.T,
+    C)`` undoes it.
+    """
+    B = np.kron(np.eye(2), np.asarray(R, dtype=np.float64))
+    return symmetrized(B @ np.asarray(Y, dtype=np.float64) @ B.T)
+
+
 def compound_left(
     T1: ArrayLike, Y1: ArrayLike, T2: ArrayLike, Y2: ArrayLike, order: int = 4
 ) -> GaussianPose:

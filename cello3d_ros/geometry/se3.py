@@ -87,7 +87,7 @@ def adjoint(T: ArrayLike) -> Array:
 def transform(T: ArrayLike, points: ArrayLike) -> Array:
     """Return the points moved by one pose.  (4, 4), (N, 3) -> (N, 3)."""
     T = np.asarray(T, dtype=np.float64)
-    return np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+    return np.asarray(np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3])
 
 
 def pose(translation: ArrayLike, quaternion: ArrayLike) -> Array:

@@ -70,6 +70,23 @@ def test_left_covariance_is_that_of_the_perturbation_seen_from_the_left() -> Non
     )
 
 
+def test_fixed_axes_are_the_additive_position_and_the_turn_before_the_pose() -> None:
+    """Sigma points of Y, as additive position and rotation vector, have the covariance C."""
+    rng = np.random.default_rng(44)
+    T = poses(1, rng)[0]
+    Y = covariances(1, rng, 1e-10)[0]
+    xi = np.linalg.cholesky(Y).T
+    moved = T @ se3.exp(xi)
+    u = moved[:, :3, 3] - T[:3, 3]
+    turns = np.zeros((6, 4, 4))
+    turns[:, :3, :3] = moved[:, :3, :3] @ T[:3, :3].T
+    turns[:, 3, 3] = 1.0
+    errors = np.hstack([u, se3.log(turns)[:, 3:]])
+    C = g.to_fixed_axes(T[:3, :3], Y)
+    np.testing.assert_allclose(errors.T @ errors / 1e-10, C / 1e-10, atol=1e-3, rtol=0)
+    np.testing.assert_allclose(g.to_fixed_axes(T[:3, :3].T, C), Y, atol=1e-24, rtol=0)
+
+
 # --- compounding ----------------------------------------------------------------------------
 
 
