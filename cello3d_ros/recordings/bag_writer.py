@@ -58,7 +58,8 @@ def write_bag(
     cloud, and interpolated ones between: ``odometry_per_scan`` an interval in all.
 
     provenance: kept as custom data in metadata.yaml.
-    The folder appears under its name when it is complete.  Raises RecordingError if there is one.
+    The folder appears under its name when it is complete.  Raises RecordingError when there is
+    something of that name, no scan, a stamp that does not follow, or no room to write.
     """
     path = Path(path)
     if path.exists():
@@ -90,6 +91,8 @@ def _write(
                     topic, kind, typestore=typestore, offered_qos_profiles=[_RELIABLE]
                 )
             writer.write(connections[topic], stamp_ns, typestore.serialize_cdr(message, kind))
+        if not connections:
+            raise RecordingError(f"there is no scan to write into {folder.name}")
 
 
 def _messages(

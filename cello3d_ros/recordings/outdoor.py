@@ -26,42 +26,43 @@ def garden(rng: np.random.Generator) -> tuple[Mesh, Route]:
     """Build a pavilion that the route runs through, trees, hedges and a garden wall."""
     ground = _ground(rng, wavelengths_m=(8.0, 30.0), std_m=0.18)
     ring = _ring(rng, radius_m=rng.uniform(7.5, 11.0), wobble=0.15)
-    route = smooth(_on_ground(ring, ground), closed=True)
+    route = _route(ring, ground)
     parts = [_surface(ground, 32.0, 0.03, rng)]
     at = int(rng.integers(len(route.points) // 12, len(route.points) // 6))
-    forward = route.points[at + 1] - route.points[at - 1]
-    heading = float(np.arctan2(forward[1], forward[0]))
     center = route.points[at]
-    parts.append(_pavilion(center, heading, route, rng))
+    parts.append(_pavilion(center, route, rng))
     edge = rng.uniform(14.0, 20.0)
     parts += [
         box([sx * edge, 0.0, 0.6], [0.3, 2 * edge, 2.6]) for sx in (-1, 1) if rng.uniform() < 0.7
     ]
     for place in _places(rng, 30, 2.0 * edge, 2.5):
-        if route.distance(place) < 1.2 or np.linalg.norm(place - center[:2]) < 4.5:
-            continue
-        foot = np.array([*place, ground(place)])
-        if rng.uniform() < 0.6:
-            parts.append(_tree(foot, rng.uniform(4.0, 8.0), 220, rng))
-        elif rng.uniform() < 0.6:
-            parts.append(facets(raised(foot, 0.4), rng.uniform(0.4, 0.8, size=3), 150, 0.1, rng))
-        else:
-            size = [rng.uniform(1.0, 2.0), rng.uniform(0.3, 0.6), rng.uniform(0.6, 1.4)]
-            parts.append(box(raised(foot, 0.3), size, rng.uniform(0, np.pi)))
+        if route.distance(place) > 1.2 and np.linalg.norm(place - center[:2]) > 4.5:
+            parts.append(_plant(np.array([*place, ground(place)]), route, rng))
     return _clear_of(route, join(parts)), route
+
+
+def _plant(foot: Array, route: Route, rng: np.random.Generator) -> Mesh:
+    """Return a tree, a bush or a cut hedge."""
+    kind = rng.uniform()
+    if kind < 0.6:
+        return _tree(foot, rng.uniform(4.0, 8.0), 220, route, rng)
+    if kind < 0.85:
+        return facets(raised(foot, 0.4), rng.uniform(0.4, 0.8, size=3), 150, 0.1, rng)
+    size = [rng.uniform(1.0, 2.0), rng.uniform(0.3, 0.6), rng.uniform(0.6, 1.4)]
+    return box(raised(foot, 0.3), size, rng.uniform(0, np.pi))
 
 
 def wood(rng: np.random.Generator) -> tuple[Mesh, Route]:
     """Build a wood: trunks with branches and foliage, bushes, fallen logs, rough ground."""
     ground = _ground(rng, wavelengths_m=(3.0, 25.0), std_m=rng.uniform(0.2, 0.4))
     ring = _ring(rng, radius_m=rng.uniform(9.0, 14.0), wobble=0.25)
-    route = smooth(_on_ground(ring, ground), closed=True)
+    route = _route(ring, ground)
     parts = [_surface(ground, 36.0, 0.06, rng)]
     for place in _places(rng, int(rng.integers(110, 220)), 66.0, 1.5):
         if route.distance(place) < 0.8:
             continue
         foot = np.array([*place, ground(place)])
-        parts.append(_tree(foot, rng.uniform(5.0, 13.0), 160, rng))
+        parts.append(_tree(foot, rng.uniform(5.0, 13.0), 160, route, rng))
     for place in _places(rng, 60, 50.0, 1.0):
         foot = np.array([*place, ground(place) + 0.3])
         parts.append(facets(foot, rng.uniform(0.3, 0.9, size=3), 90, 0.1, rng))
@@ -104,6 +105,13 @@ def _ring(rng: np.random.Generator, radius_m: float, wobble: float) -> Array:
     return np.asarray(radius_m * radius[:, None] * ring)
 
 
+def _route(ring: Array, ground: Ground) -> Route:
+    """Return the curve around the ring (W, 2), on the ground."""
+    way = smooth(np.concatenate([ring, np.zeros((len(ring), 1))], axis=1), closed=True)
+    points = np.concatenate([way.points[:, :2], ground(way.points[:, :2])[:, None]], axis=1)
+    return Route(points, closed=True)
+
+
 def _places(rng: np.random.Generator, n: int, side_m: float, apart_m: float) -> Array:
     """Return at most ``n`` random places (m, 2) of a square, no two nearer than ``apart_m``."""
     kept: list[Array] = []
@@ -113,8 +121,10 @@ def _places(rng: np.random.Generator, n: int, side_m: float, apart_m: float) -> 
     return np.array(kept)
 
 
-def _tree(foot: Array, height: float, n_leaves: int, rng: np.random.Generator) -> Mesh:
-    """Return a leaning trunk with branches, and foliage in blobs around their ends."""
+def _tree(
+    foot: Array, height: float, n_leaves: int, route: Route, rng: np.random.Generator
+) -> Mesh:
+    """Return a leaning trunk with branches, none across the route, and foliage at their ends."""
     radius = rng.uniform(0.07, 0.26)
     top = foot + np.array([*rng.normal(scale=0.05 * height, size=2), height])
     parts = [frustum(raised(foot, -0.5), top, radius, 0.4 * radius, 10)]
@@ -124,22 +134,24 @@ def _tree(foot: Array, height: float, n_leaves: int, rng: np.random.Generator) -
         angle, reach = rng.uniform(0, 2 * np.pi), rng.uniform(0.15, 0.35) * height * (1.1 - share)
         rise = rng.uniform(0.1, 0.6)
         end = base + reach * np.array([np.cos(angle), np.sin(angle), rise])
-        parts.append(frustum(base, end, 0.25 * radius, 0.1 * radius, 5))
+        if base[2] - foot[2] > 3.5 or min(route.distance(np.linspace(base, end, 9)[:, :2])) > 0.6:
+            parts.append(frustum(base, end, 0.25 * radius, 0.1 * radius, 5))
         blob = rng.uniform(0.4, 0.9, size=3) * max(0.8, 0.12 * height)
         parts.append(facets(end, blob, n_leaves // n_branches, 0.14, rng))
     return join(parts)
 
 
-def _pavilion(center: Array, heading: float, route: Route, rng: np.random.Generator) -> Mesh:
+def _pavilion(center: Array, route: Route, rng: np.random.Generator) -> Mesh:
     """Return a floor, pillars around it with a beam on top, a pointed roof and benches.
 
-    The route enters and leaves halfway between two pillars.
+    It is turned so that the pillars keep clear of the route.
     """
     n = int(rng.choice([4, 6, 8]))
     radius, height = rng.uniform(2.3, 3.2), rng.uniform(2.4, 3.0)
-    angle = heading + (np.arange(n) + 0.5) * 2 * np.pi / n
-    out = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=1)
-    feet = center + radius * out
+    angle = np.arange(n) * 2 * np.pi / n + np.linspace(0, 2 * np.pi / n, 25)[:, None]
+    out = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+    clearance = route.distance(center[:2] + radius * out[..., :2]).min(axis=1)
+    feet = center + radius * out[np.argmax(clearance)]
     thick = rng.uniform(0.1, 0.17)
     up = np.array([0.0, 0.0, height])
     parts = [
@@ -168,7 +180,3 @@ def _clear_of(route: Route, mesh: Mesh) -> Mesh:
     above = middle[:, 2] - route.points[nearest, 2]
     hit = small & (route.distance(middle[:, :2]) < 0.6) & (above > 0.35) & (above < 2.4)
     return Mesh(mesh.vertices, mesh.triangles[~hit])
-
-
-def _on_ground(ring: Array, ground: Ground) -> Array:
-    return np.concatenate([ring, ground(ring)[:, None]], axis=1)

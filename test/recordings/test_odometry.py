@@ -1,0 +1,106 @@
+"""Drift has the stated statistics; poses are looked up between recorded ones."""
+
+import numpy as np
+import pytest
+
+from cello3d_ros.errors import RecordingError
+from cello3d_ros.geometry import se3
+from cello3d_ros.recordings.odometry import PoseTrack, drift_odometry
+
+
+def walk(n: int, step: float, turn: float):
+    """Return n poses, each ``step`` metres ahead of and ``turn`` rad left of the one before."""
+    one = se3.exp([step, 0, 0, 0, 0, turn])
+    poses = [se3.exp([3.0, -2.0, 1.0, 0.1, 0.2, 0.3])]
+    for _ in range(n - 1):
+        poses.append(poses[-1] @ one)
+    return np.stack(poses)
+
+
+def errors(truth, odometry):
+    """Return the twists (n - 1, 6) by which the relative motions differ."""
+    true, seen = (se3.inverse(T[:-1]) @ T[1:] for T in (truth, odometry))
+    return se3.log(se3.inverse(true) @ seen)
+
+
+def test_odometry_starts_at_identity_whatever_the_first_pose() -> None:
+    odometry = drift_odometry(walk(5, 0.5, 0.1), np.random.default_rng(0))
+    assert np.array_equal(odometry[0], np.eye(4))
+    assert all(se3.is_rigid(T, 1e-9) for T in odometry)
+
+
+def test_without_noise_odometry_is_ground_truth_seen_from_the_start() -> None:
+    truth = walk(20, 0.5, 0.1)
+    odometry = drift_odometry(
+        truth, np.random.default_rng(0),
+        translation_share=0, rotation_rad_per_m=0, rotation_share=0,
+    )  # fmt: skip
+    assert np.allclose(odometry, se3.inverse(truth[0]) @ truth, atol=1e-12)
+
+
+def test_drift_straight_ahead_is_two_percent_and_half_a_degree_a_metre() -> None:
+    truth = walk(4000, 0.5, 0.0)
+    xi = errors(truth, drift_odometry(truth, np.random.default_rng(1)))
+    assert np.allclose(xi[:, :3].std(axis=0), 0.02 * 0.5, rtol=0.06)
+    assert np.allclose(xi[:, 3:].std(axis=0), np.radians(0.5) * 0.5, rtol=0.06)
+    assert np.abs(xi.mean(axis=0) / xi.std(axis=0)).max() < 4 / np.sqrt(len(xi))
+
+
+def test_drift_of_a_turn_in_place_is_a_share_of_the_turn() -> None:
+    truth = walk(4000, 0.0, 0.2)
+    xi = errors(truth, drift_odometry(truth, np.random.default_rng(2)))
+    assert np.allclose(xi[:, 3:].std(axis=0), 0.05 * 0.2, rtol=0.06)
+    assert np.abs(xi[:, :3]).max() < 1e-9
+
+
+def test_a_robot_that_stands_still_does_not_drift() -> None:
+    odometry = drift_odometry(walk(10, 0.0, 0.0), np.random.default_rng(3))
+    assert np.allclose(odometry, np.eye(4), atol=1e-12)
+
+
+def test_one_pose_is_enough() -> None:
+    assert drift_odometry(np.eye(4)[None], np.random.default_rng(0)).shape == (1, 4, 4)
+
+
+def test_ground_truth_is_not_changed_in_place() -> None:
+    truth = walk(5, 0.5, 0.1)
+    before = truth.copy()
+    drift_odometry(truth, np.random.default_rng(0))
+    assert np.array_equal(truth, before)
+
+
+ROWS = [[0, 0, 0, 0, 0, 0, 1], [2, 0, 0, 0, 0, np.sin(0.5), np.cos(0.5)]]
+
+
+def test_a_track_is_interpolated_between_its_poses() -> None:
+    track = PoseTrack([100, 200], ROWS)
+    T = track.at(125)
+    assert np.allclose(T[:3, 3], [0.5, 0, 0])
+    assert np.allclose(se3.log(T)[3:], [0, 0, 0.25])
+
+
+def test_a_track_says_nothing_outside_its_span() -> None:
+    track = PoseTrack([100, 200], ROWS)
+    assert track.at(99) is None
+    assert track.at(201) is None
+    assert np.allclose(track.at(100), np.eye(4))
+    assert np.allclose(track.at(200)[:3, 3], [2, 0, 0])
+    assert PoseTrack([], []).at(0) is None
+
+
+def test_large_stamps_keep_their_nanoseconds() -> None:
+    start = 1_600_000_000_000_000_001
+    track = PoseTrack([start, start + 4], ROWS)
+    assert np.allclose(track.at(start + 1)[:3, 3], [0.5, 0, 0], atol=1e-12)
+
+
+def test_a_track_sorts_its_poses_and_keeps_the_last_of_one_stamp() -> None:
+    track = PoseTrack([200, 100, 200], [ROWS[0], ROWS[0], ROWS[1]])
+    assert [stamp for stamp, _ in track] == [100, 200]
+    assert np.allclose(track.at(200)[:3, 3], [2, 0, 0])
+
+
+@pytest.mark.parametrize("bad", [[np.nan, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 0]])
+def test_a_pose_with_nan_or_a_zero_quaternion_is_named(bad: list[float]) -> None:
+    with pytest.raises(RecordingError, match="pose 1 "):
+        PoseTrack([100, 200], [ROWS[0], bad])
