@@ -1,0 +1,43 @@
+# make demo    set up, replay bags/demo through the node, judge its answers: build/demo/
+# make test    set up, run the whole test suite
+# make check   set up, lint, check types and import rules
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+# Recordings and reference results for the tests that can use them (data/, bench/); optional.
+export CELLO3D_EVALUATION ?= $(realpath ../shared)
+export ROS_PYTHON_CHECK_FIELDS := 1
+
+.PHONY: demo test check format clean
+
+demo: $(VENV)/.ready
+	$(BIN)/cello3d demo --out build/demo
+
+test: $(VENV)/.ready
+	$(BIN)/python -m pytest
+
+check: $(VENV)/.ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(VENV)/.ready
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) build
+
+# The ROS that is sourced is used when there is one, ROS 2 wheels from PyPI otherwise.
+$(VENV)/.ready: setup.py
+	set -e; \
+	if $(PYTHON) -c "import rclpy" 2>/dev/null; then \
+	  $(PYTHON) -m venv --system-site-packages $(VENV); extras="open3d,dev"; \
+	else \
+	  $(PYTHON) -m venv $(VENV); extras="ros,open3d,dev"; \
+	fi; \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$$extras]"
+	touch $@
