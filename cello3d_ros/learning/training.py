@@ -36,7 +36,7 @@ from cello3d_ros.geometry.se3 import Array, adjoint, exp
 from cello3d_ros.learning.dataset import Dataset, PairRecord, package_versions
 
 Indices = NDArray[np.intp]
-Progress = Callable[[int, float, float], None]  # iteration, training loss, validation loss
+Progress = Callable[[int, float, float], None]  # iteration, training loss, what Theta is judged by
 Figures = dict[str, dict[str, float]]  # predictor -> measure -> value
 
 _FREE = ("seed", "n_samples", "max_gap")  # sampling settings in which datasets may differ
@@ -133,7 +133,8 @@ def train(
     """Fit Theta by L-BFGS and return the model with the best one met.
 
     Best is by the loss on the validation recordings, predicted from the examples, or without them
-    by the leave-recording-out loss; training ends when that has not improved for 20 iterations.
+    by the regularised leave-recording-out loss; training ends when that has not improved for 20
+    iterations.
     Theta = 0, the mean of the examples, takes part.  Deterministic; an interrupt (Ctrl-C) ends
     training with the best so far.  Raises DatasetError for fewer than two recordings.
     """
@@ -143,7 +144,9 @@ def train(
     judge = problem
     if validation is not None:
         judge = _validation_problem(problem, validation, config, mean, scale)
-    search = _Search(_selected(problem, active), _selected(judge, active), config, progress)
+    searched = _selected(problem, active)
+    judging = searched if validation is None else _selected(judge, active)
+    search = _Search(searched, judging, config, progress)
     search.run()
     theta = _expanded(search.theta, active, len(mean))
     figures = {"leave_recording_out": _figures(problem, theta, examples, examples, config)}
@@ -313,8 +316,14 @@ class _Search:
         penalty = self._config.regularization
         return value + penalty * float(free @ free), gradient.ravel() + 2.0 * penalty * free
 
-    def _judged(self, theta: Array, problem: Problem | None = None) -> float:
-        problem = problem or self._judge
+    def _judged(self, theta: Array) -> float:
+        """Return the loss on validation, or without it what the search minimises."""
+        if self._judge is self._problem:
+            penalty = self._config.regularization * float(np.sum(theta**2))
+            return self._loss(theta, self._problem) + penalty
+        return self._loss(theta, self._judge)
+
+    def _loss(self, theta: Array, problem: Problem) -> float:
         return float(_losses(predicted(theta, problem), problem.Y, self._config.loss)[0].mean())
 
     def _step(self, free: Array) -> None:
@@ -329,10 +338,7 @@ class _Search:
         if judged < self._best:
             self._best, self.theta, self.best_iteration = judged, theta, self.n_iterations
         if self._progress is not None:
-            training = judged
-            if self._judge is not self._problem:
-                training = self._judged(theta, self._problem)
-            self._progress(self.n_iterations, training, judged)
+            self._progress(self.n_iterations, self._loss(theta, self._problem), judged)
 
 
 class _Stop(Exception):

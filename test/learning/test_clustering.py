@@ -25,10 +25,10 @@ def noise(n: int, seed: int = 0) -> Array:
 
 @pytest.mark.parametrize("n", [65, 500, 5000])
 def test_of_two_clusters_the_one_nearest_ground_truth_is_kept(n: int) -> None:
-    near, far = noise(n), noise(2 * n, 1) + np.array([0.6, 0, 0, 0, 0, 0.3])
+    near, far = noise(n), noise(n // 2, 1) + np.array([0.6, 0, 0, 0, 0, 0.3])
     mask = kept(np.concatenate([far, near]))
-    assert not mask[: 2 * n].any()
-    assert mask[2 * n :].mean() > 0.98
+    assert not mask[: n // 2].any()
+    assert mask[n // 2 :].mean() > 0.98
     xi = np.concatenate([far, near])[mask]
     ratio = np.linalg.solve(np.diag(NOISE**2), xi.T @ xi / (len(xi) - 1))
     divergence = 0.5 * (np.trace(ratio) - 6 - np.linalg.slogdet(ratio)[1])
@@ -97,6 +97,13 @@ def test_scattered_samples_make_no_cluster() -> None:
     assert not kept(xi).any()
     assert kept(np.zeros((0, 6))).shape == (0,)
     assert not kept(np.zeros((1, 6))).any()
+
+
+def test_a_handful_of_samples_near_the_truth_is_no_cluster_of_many() -> None:
+    xi = np.concatenate([noise(5), noise(995, 1) + 0.3])
+    assert nearest_cluster(xi, 0.1, 0.05, 0.0)[:5].all()
+    assert not nearest_cluster(xi, 0.1, 0.05, 0.01)[:5].any()
+    assert nearest_cluster(xi, 0.1, 0.05, 0.01)[5:].mean() > 0.98
 
 
 def test_the_order_of_the_samples_does_not_matter() -> None:

@@ -180,6 +180,52 @@ def test_planted_feature_is_found_and_beats_the_mean() -> None:
     assert weights[3] > 3 * np.delete(weights, 3).max()
 
 
+def test_targets_are_the_pairs_as_they_were_recorded() -> None:
+    examples = some(rotations=(0.5, 0.0, 1.0))
+    config = TrainingConfig(shape="none")
+    problem = leave_out_problem(examples, config, np.zeros(5), np.ones(5))
+    np.testing.assert_array_equal(problem.X, examples.features[:, 1])
+    np.testing.assert_array_equal(problem.Y, examples.covariances)
+    np.testing.assert_array_equal(problem.X_examples, examples.features.reshape(-1, 5))
+    with pytest.raises(DatasetError, match="none at 0 rad"):
+        train(some(rotations=(0.5, 1.0)), config)
+
+
+@pytest.mark.parametrize("form", ["upper_triangular", "diagonal", "low_rank"])
+def test_the_search_ends_where_the_regularised_gradient_vanishes(form: str) -> None:
+    examples = planted(80)
+    config = dataclasses.replace(
+        PAPER, theta=form, rank=2, regularization=0.02, max_iterations=500
+    )
+    model = train(examples, config).model
+    problem = leave_out_problem(examples, config, model.mean, model.scale)
+    _, gradient = loss_and_gradient(model.theta, problem)
+    residual = gradient + 2 * 0.02 * model.theta
+    if form != "low_rank":
+        residual = np.triu(residual)
+    if form == "diagonal":
+        residual = np.diag(np.diag(residual))
+    assert np.abs(residual).max() < 0.02 * np.abs(2 * 0.02 * model.theta).max()
+    if form != "low_rank":
+        assert not np.tril(model.theta, -1).any()
+
+
+@pytest.mark.parametrize("form", ["upper_triangular", "diagonal", "low_rank"])
+def test_the_search_starts_where_many_examples_are_heard(form: str) -> None:
+    examples = some(150, n_features=60)
+    losses: list[float] = []
+    train(
+        examples,
+        dataclasses.replace(PAPER, theta=form, max_iterations=1),
+        progress=lambda iteration, training, judged: losses.append(training),
+    )
+    config = dataclasses.replace(PAPER, theta="diagonal")
+    problem = leave_out_problem(examples, config, np.zeros(60), np.ones(60))
+    of_mean, _ = loss_and_gradient(np.zeros(60), problem)
+    of_nearest, _ = loss_and_gradient(np.ones(60), problem)
+    assert of_mean - 0.5 < losses[0] < of_mean + 0.5 < of_nearest
+
+
 @pytest.mark.parametrize("form", ["upper_triangular", "diagonal", "low_rank"])
 def test_pure_noise_is_within_two_percent_of_the_mean(form: str) -> None:
     config = dataclasses.replace(PAPER, theta=form, rank=4, regularization=0.03)
