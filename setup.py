@@ -5,7 +5,10 @@ from setuptools import find_packages, setup
 NAME = "cello3d_ros"
 
 ROS = ["ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"]
-OPEN3D = ["open3d-cpu>=0.19; platform_machine == 'x86_64'", "open3d>=0.19; platform_machine != 'x86_64'"]
+OPEN3D = [
+    "open3d-cpu>=0.19; platform_machine == 'x86_64'",
+    "open3d>=0.19; platform_machine != 'x86_64'",
+]
 TEST = ["pytest"]
 
 setup(
@@ -36,7 +39,7 @@ setup(
         "open3d": OPEN3D,
         "cluster": ["distributed>=2024.1"],
         "test": TEST,
-        "dev": [*TEST, "ruff", "mypy", "import-linter", "types-PyYAML", "types-tqdm", "scipy-stubs"],
+        "dev": [*TEST, "ruff", "mypy", "import-linter", "types-PyYAML"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

@@ -14,7 +14,9 @@ from cello3d_ros.config import Config, load_config, pipeline_of
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
     parser.add_argument("recordings", nargs="+", metavar="RECORDING", help="bag or data set")
-    parser.add_argument("--out", required=True, metavar="DATASET", help="folder to write or resume")
+    parser.add_argument(
+        "--out", required=True, metavar="DATASET", help="folder to write or resume"
+    )
     parser.add_argument("--config", metavar="FILE", help="YAML settings; flags below win")
     parser.add_argument("--samples", type=int, metavar="N", help="registrations of each pair")
     parser.add_argument("--variance", type=float, metavar="A", help="of the starts (m^2, rad^2)")
@@ -52,11 +54,11 @@ def run(arguments: argparse.Namespace) -> None:
     with tqdm(total=total, unit="pair", disable=not sys.stderr.isatty()) as bar:
         for recording in recordings:
             name = recording.name
-            done = {ij for ij in pairs(len(recording), sampling.max_gap) if dataset.has(name, *ij)}
-            bar.update(len(done))
-            for record in sample_recording(
-                recording, pipeline, sampling, lambda i, j, d=done: (i, j) in d, arguments.jobs
-            ):
+            todo = [
+                ij for ij in pairs(len(recording), sampling.max_gap) if not dataset.has(name, *ij)
+            ]
+            bar.update(len(pairs(len(recording), sampling.max_gap)) - len(todo))
+            for record in sample_recording(recording, todo, pipeline, sampling, arguments.jobs):
                 dataset.write(record)
                 bar.update()
         for record in dataset:

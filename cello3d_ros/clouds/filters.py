@@ -12,7 +12,7 @@ def crop_range(points: Array, min_m: float, max_m: float) -> Array:
     """Return the points whose distance from the sensor is in [min_m, max_m].  (N, 3) -> (M, 3)."""
     with np.errstate(over="ignore"):
         range2 = np.einsum("ij,ij->i", points, points)
-    return points[(range2 >= min_m**2) & (range2 <= max_m**2)]
+    return np.asarray(points[(range2 >= min_m**2) & (range2 <= max_m**2)])
 
 
 def limit_density(

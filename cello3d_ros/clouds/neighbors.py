@@ -2,8 +2,9 @@
 
 Neighbours serve both the local shape of a cloud and ICP, hence this lowest room.  The tree is
 implicit: node i has the children 2i + 1 and 2i + 2, and each half of a node's points goes to one
-child, so that only the nodes' bounding boxes and the leaves' ranges of points are stored.  A box is pruned when its distance is not below that of the k-th neighbour found so far: exact.
-Kernels release the GIL, so that threads can share a tree.
+child, so that only the nodes' bounding boxes and the leaves' ranges of points are stored.  A box
+is pruned when its distance is not below that of the k-th neighbour found so far: exact.  Kernels
+release the GIL, so that threads can share a tree.
 """
 
 from __future__ import annotations
@@ -107,7 +108,7 @@ def _build(points: Array, order: Indices) -> tuple[Array, Indices]:
             starts[2 * i] = starts[i]
             starts[2 * i - 1] = (starts[i - 1] + starts[i]) // 2
         for i in range(n_nodes):
-            axis = np.argmax(level[i, 3:] - level[i, :3])
+            axis = int(np.argmax(level[i, 3:] - level[i, :3]))
             _select(points, order, starts[2 * i], starts[2 * i + 2] - 1, starts[2 * i + 1], axis)
         n_nodes *= 2
 
@@ -156,7 +157,7 @@ def _box_distance2(box: Array, x: float, y: float, z: float) -> float:
     dx = max(max(box[0] - x, x - box[3]), 0.0)
     dy = max(max(box[1] - y, y - box[4]), 0.0)
     dz = max(max(box[2] - z, z - box[5]), 0.0)
-    return dx * dx + dy * dy + dz * dz
+    return float(dx * dx + dy * dy + dz * dz)
 
 
 @njit(cache=True, nogil=True)

@@ -75,7 +75,7 @@ def _normal_matrices(
 ) -> tuple[Array, Array]:
     """Return H = sum J^T J and G = sum_i g_i g_i^T, g_i = sum J^T r over one point's neighbours.
 
-    The residual of ``T exp(xi) p`` has the Jacobian ``[m, p x m]``, m = R^T n: right, reading side.
+    The residual of ``T exp(xi) p`` has the Jacobian ``[m, p x m]``, m = R^T n: the reading side.
     """
     H, G = np.zeros((6, 6)), np.zeros((6, 6))
     J, g = np.empty(6), np.empty(6)

@@ -138,5 +138,7 @@ def _coefficients(angle2: Array) -> tuple[Array, Array, Array]:
     a = np.where(small, 1 - x / 6 * (1 - x / 20 * (1 - x / 42)), np.sin(t) / t)
     half = np.sin(0.5 * t) / t
     b = np.where(small, 0.5 - x / 24 * (1 - x / 30 * (1 - x / 56)), 2 * half * half)
-    c = np.where(small, 1 / 6 - x / 120 * (1 - x / 42 * (1 - x / 72)), (t - np.sin(t)) / (safe2 * t))
+    c = np.where(
+        small, 1 / 6 - x / 120 * (1 - x / 42 * (1 - x / 72)), (t - np.sin(t)) / (safe2 * t)
+    )
     return a, b, c

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +16,6 @@ from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log
 from cello3d_ros.learning.clustering import nearest_cluster, offset
 from cello3d_ros.learning.dataset import PairRecord
-from cello3d_ros.learning.pairs import pairs
 from cello3d_ros.recordings.recording import Recording, Scan
 from cello3d_ros.registration.icp import register, register_many
 
@@ -25,18 +24,17 @@ _FEWEST_KEPT = 12  # twice the dimensions: fewer make no covariance worth learni
 
 def sample_recording(
     recording: Recording,
+    todo: list[tuple[int, int]],
     pipeline: Pipeline,
     sampling: SamplingConfig,
-    is_done: Callable[[int, int], bool],
     n_threads: int = 1,
 ) -> Iterator[PairRecord]:
-    """Sample the pairs of a recording that are not done, in the order of ``pairs``.
+    """Sample pairs (i, j) of a recording, some or all of ``pairs``, in the order of j.
 
     One pass that remembers ``max_gap`` scans.  Each record follows from the recording, its name
-    and the settings alone: what is done already and the number of threads do not matter.
+    and the settings alone: which others are done and the number of threads do not matter.
     Raises RecordingError when a scan has no ground truth.
     """
-    todo = [ij for ij in pairs(len(recording), sampling.max_gap) if not is_done(*ij)]
     by_reading = {j: [i for i, reading in todo if reading == j] for _, j in todo}
     needed = {index for ij in todo for index in ij}
     window: dict[int, tuple[Cloud | CloudError, Array]] = {}
@@ -67,12 +65,12 @@ def sample_pair(
     starts from the truth, as it will be online.  Source: Sec. IV-D, V-A.
     """
     seed = [sampling.seed, _name_seed(recording), i, j]
-    base = PairRecord(recording=recording, i=i, j=j, accepted=False, T_mean=T_mean, reason="not sampled")
+    base = PairRecord(
+        recording=recording, i=i, j=j, accepted=False, T_mean=T_mean, reason="not sampled"
+    )
     at_truth = register(reading, reference, T_mean, pipeline.icp, np.random.default_rng(seed))
     try:
-        pair = describe(
-            reading, reference, at_truth.T_ref_read, pipeline, sampling.n_rotations
-        )
+        pair = describe(reading, reference, at_truth.T_ref_read, pipeline, sampling.n_rotations)
     except NoOverlapError:
         return replace(base, reason="no_overlap")
     except RegistrationError:
@@ -153,5 +151,3 @@ def _prepared(
 def _name_seed(name: str) -> int:
     """Return a number that tells recordings apart, the same on every machine."""
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "little")
-
-

@@ -93,9 +93,7 @@ def register(
     """Register random subsamples of two clouds, drawn anew: they are part of ICP's noise."""
     read = subsample(len(reading.points), config.n_reading_points, rng)
     ref = subsample(len(reference.points), config.n_reference_points, rng)
-    return icp(
-        reading.points[read], reference.points[ref], reference.normals[ref], T_init, config
-    )
+    return icp(reading.points[read], reference.points[ref], reference.normals[ref], T_init, config)
 
 
 def register_many(
@@ -196,9 +194,7 @@ def _associate(
 
 
 @njit(cache=True, nogil=True)
-def _search(
-    moved: Array, tree: KdTree, cap2: float, distances2: Array, indices: Indices
-) -> int:
+def _search(moved: Array, tree: KdTree, cap2: float, distances2: Array, indices: Indices) -> int:
     """Fill the k nearest neighbours whose squared distance is below ``cap2``; count them.
 
     The neighbours of the step before are as good a set of k points as any: the k-th neighbour
@@ -350,7 +346,8 @@ def _rotation(omega: Array) -> Array:
         return np.eye(3)
     s = math.sin(angle) / angle
     c = 2.0 * (math.sin(0.5 * angle) / angle) ** 2
-    return np.eye(3) + s * K + c * (K @ K)
+    R: Array = np.eye(3) + s * K + c * (K @ K)
+    return R
 
 
 @njit(cache=True, nogil=True)
@@ -358,5 +355,3 @@ def _angle(R: Array) -> float:
     """Return the angle of a rotation, accurate near zero."""
     x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
     return math.atan2(math.sqrt(x * x + y * y + z * z), R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
-
-

@@ -10,7 +10,7 @@ NUMBERS = {"f4": 7, "f8": 8, "u2": 4, "u1": 2}
 
 
 def message(points, layout, *, big=False, height=1, padding=0, extra=b""):
-    """Build a PointCloud2-like message; layout is a list of (name, type, offset), point_step last."""
+    """Build a PointCloud2-like message; layout: (name, type, offset) of each field, point_step."""
     *fields, step = layout
     order = ">" if big else "<"
     dtype = np.dtype(

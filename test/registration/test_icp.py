@@ -93,7 +93,11 @@ def test_a_registration_tells_how_it_ended(pair):
     stopped = icp(
         reading, reference, normals, T @ exp([0.3, 0, 0, 0, 0, 0.3]), IcpConfig(max_iterations=2)
     )
-    assert (stopped.converged, stopped.reason, stopped.n_iterations) == (False, "max_iterations", 2)
+    assert (stopped.converged, stopped.reason, stopped.n_iterations) == (
+        False,
+        "max_iterations",
+        2,
+    )
 
 
 def test_the_residual_is_that_of_the_kept_associations(pair):
