@@ -79,11 +79,12 @@ class Statistics:
         return message
 
     def _level(self) -> bytes:
+        level: bytes = DiagnosticStatus.OK
         if self._n_failed_in_a_row >= self._n_serious:
-            return DiagnosticStatus.ERROR
-        if self._n_failed_in_a_row or self._last_event == WAITING:
-            return DiagnosticStatus.WARN
-        return DiagnosticStatus.OK
+            level = DiagnosticStatus.ERROR
+        elif self._n_failed_in_a_row or self._last_event == WAITING:
+            level = DiagnosticStatus.WARN
+        return level
 
     def _sentence(self) -> str:
         if self._n_failed_in_a_row:

@@ -10,6 +10,8 @@ not be fused as if they were independent.  Nothing is published for a cloud with
 
 from __future__ import annotations
 
+import math
+import re
 import signal
 import sys
 import time
@@ -23,12 +25,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
+from rclpy.clock import Clock, JumpThreshold, TimeJump
+from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.utilities import try_shutdown
 from sensor_msgs.msg import PointCloud2
 
 from cello3d_ros.clouds.pointcloud2 import read_points
@@ -48,6 +52,7 @@ NAME = "covariance_node"
 
 _TICK_S = 0.05  # how often it is looked whether a cloud has waited too long
 _WARNING_PERIOD_S = 5.0  # warnings of one kind come at most this often
+_MAX_WARNINGS = 100  # kinds of warnings remembered
 
 
 class CovarianceNode(Node):
@@ -133,24 +138,32 @@ class CovarianceNode(Node):
         self._statistics.counts["received"] += 1
         received_s = time.monotonic()
         stamp_ns = messages.stamp_ns_of(message)
-        try:
-            self._check_not_in_future(stamp_ns)
-            points = read_points(message)
-        except OdometryError as error:
-            return self._skip(Skip(stamp_ns, "future_stamp", str(error)))
-        except CloudError as error:
-            return self._skip(Skip(stamp_ns, "malformed", str(error)))
-        order = stamp_order(stamp_ns, self._newest_cloud_ns)
-        if order == "jump":
-            self._forget(stamp_ns)
-        elif order != "later":
-            what = order.replace("_", " ")
-            return self._skip(Skip(stamp_ns, order, f"{what}: not later than the cloud before"))
-        self._newest_cloud_ns = stamp_ns
+        points = self._admitted(stamp_ns, message)
+        if isinstance(points, Skip):
+            self._skip(points)
+            return
         job = Job(stamp_ns, points, message.header.frame_id, received_s)
         for skip in self._intake.offer(job):
             self._skip(skip)
         self._work_is_there.trigger()
+
+    def _admitted(self, stamp_ns: int, message: PointCloud2) -> Array | Skip:
+        """Return the points of a cloud in its turn; a damaged one does not move the clock."""
+        try:
+            self._check_not_in_future(stamp_ns)
+            points = read_points(message)
+        except OdometryError as error:
+            return Skip(stamp_ns, "future_stamp", str(error))
+        except CloudError as error:
+            return Skip(stamp_ns, "malformed", str(error))
+        order = stamp_order(stamp_ns, self._newest_cloud_ns)
+        if order == "jump":
+            self._forget(stamp_ns)
+        elif order != "later":
+            sentence = f"{order.replace('_', ' ')}: not later than the cloud before"
+            return Skip(stamp_ns, order, sentence)
+        self._newest_cloud_ns = stamp_ns
+        return points
 
     def _work(self) -> None:
         job, skips = self._intake.take()
@@ -206,9 +219,12 @@ class CovarianceNode(Node):
         self._publish_diagnostics()
 
     def _warn(self, kind: str, sentence: str) -> None:
-        now_s = time.monotonic()
-        if now_s - self._warned_s.get(kind, -_WARNING_PERIOD_S) >= _WARNING_PERIOD_S:
-            self._warned_s[kind] = now_s
+        """Log, but sentences that differ only in numbers at most once a while."""
+        key, now_s = kind + re.sub(r"[0-9.]+", "", sentence), time.monotonic()
+        if now_s - self._warned_s.get(key, -math.inf) >= _WARNING_PERIOD_S:
+            if len(self._warned_s) >= _MAX_WARNINGS:
+                self._warned_s.clear()
+            self._warned_s[key] = now_s
             self.get_logger().warning(sentence)
 
     def _publish_diagnostics(self) -> None:
@@ -267,13 +283,13 @@ def main(args: Sequence[str] | None = None) -> int:
         print(f"{NAME}: {error}", file=sys.stderr)
         return 1
     finally:
-        rclpy.try_shutdown()
+        try_shutdown()
     return 0
 
 
 def _initialise(args: Sequence[str] | None) -> None:
     try:
-        rclpy.init(args=args)
+        rclpy.init(args=None if args is None else list(args))
     except (RuntimeError, ValueError) as error:
         text = " ".join(str(error).split())
         raise ConfigError(f"cannot start with these ROS arguments: {text}") from None

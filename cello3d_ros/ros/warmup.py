@@ -17,7 +17,7 @@ def room(rng: np.random.Generator, n_points: int = 4000, size_m: float = 6.0) ->
     """Return (N, 3) points on the walls, floor and ceiling of a room and on a crate in it."""
     walls = _box(rng, n_points, np.array([size_m, 0.8 * size_m, 0.5 * size_m]))
     crate = _box(rng, n_points // 4, np.array([1.0, 0.7, 0.9]))
-    return np.vstack([walls, crate + [0.25 * size_m, 0.2 * size_m, -0.2 * size_m]])
+    return np.vstack([walls, crate + np.array([0.25, 0.2, -0.2]) * size_m])
 
 
 def warm_up(model: Model, config: Config) -> None:

@@ -1,7 +1,155 @@
 """Real ROS with checked message fields, seen by this machine only, in a domain of this run."""
 
 import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
-os.environ.setdefault("ROS_PYTHON_CHECK_FIELDS", "1")
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+import numpy as np
+import pytest
+
+from cello3d_ros.covariance.model import constant_model, save_model
+from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.gaussian import is_positive_definite
+from cello3d_ros.ros.process import NodeProcess, environment
+from cello3d_ros.ros.warmup import room
+
+DOMAIN_ID = 1 + os.getpid() % 100
+
+os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
+os.environ.update(environment(DOMAIN_ID))
+
+STEP_NS = 100_000_000
+
+
+class Robot:
+    """Walks about a room, one scan a step, and sends what it sees or whatever a test makes up."""
+
+    def __init__(self, player: Any) -> None:
+        self.player = player
+        self.rng = np.random.default_rng(1)
+        self.stamp_ns = 10**18
+        self.n = 0
+
+    def pose(self) -> np.ndarray:
+        """Where the robot is now."""
+        a = 0.2 * self.n
+        return se3.exp([0.5 * np.sin(a), 0.3 * np.cos(a), 0, 0, 0, 0.1 * np.sin(a)])
+
+    def points(self, n_points: int = 4000, size_m: float = 6.0) -> np.ndarray:
+        """What the robot sees now, in its room or in a hall that does not fit it."""
+        return se3.transform(se3.inverse(self.pose()), room(self.rng, n_points, size_m))
+
+    def step(self, dt_ns: int = STEP_NS) -> int:
+        """Walk on; return the new stamp."""
+        self.n += 1
+        self.stamp_ns += dt_ns
+        return self.stamp_ns
+
+    def send(self, cloud: Any, odometry: bool = True, timeout_s: float = 10.0) -> dict[str, str]:
+        """Send points or a whole message stamped now; return what diagnostics say of it."""
+        if odometry:
+            self.player.publish_odometry(self.stamp_ns, self.pose())
+        if isinstance(cloud, np.ndarray):
+            self.player.publish_cloud(self.stamp_ns, cloud)
+        else:
+            self.player.clouds.publish(cloud)
+        return self.settled(timeout_s)
+
+    def settled(self, timeout_s: float = 10.0) -> dict[str, str]:
+        """Wait for the fate of the cloud stamped now."""
+        replay = self.player.replay
+        assert self.player.spin_until(lambda: replay.is_settled(self.stamp_ns), timeout_s), (
+            f"nothing was heard of the cloud; the last was {replay.last_status}"
+        )
+        return replay.status[self.stamp_ns]
+
+    def walk(self, n_steps: int = 1) -> dict[str, str]:
+        """Take good steps and return the status of the last; a first scan is a reference."""
+        for _ in range(n_steps):
+            self.step()
+            status = self.send(self.points())
+        return status
+
+    def assert_right_again(self) -> None:
+        """The next good scan is answered, and rightly."""
+        status = self.walk()
+        assert status["last_event"] == "answered"
+        before_ns = int(status["reference_stamp_ns"])
+        n_before = self.n - round((self.stamp_ns - before_ns) / STEP_NS)
+        here = self.pose()
+        self.n, n_here = n_before, self.n
+        T_true = se3.inverse(self.pose()) @ here
+        self.n = n_here
+        error = se3.log(se3.inverse(T_true) @ self.player.replay.relative[self.stamp_ns].T)
+        assert np.abs(error).max() < 0.02
+
+    def assert_sane(self) -> None:
+        """Everything ever published is finite, exactly symmetric and positive definite."""
+        replay = self.player.replay
+        for pose in [*replay.relative.values(), *replay.poses.values()]:
+            assert np.isfinite(pose.T).all()
+            assert se3.is_rigid(pose.T, 1e-9)
+            assert (pose.C == pose.C.T).all()
+            assert is_positive_definite(pose.C)
+            assert np.linalg.eigvalsh(pose.C)[0] > 0.0
+
+
+@pytest.fixture(scope="session")
+def domain_id() -> int:
+    """The ROS domain of this run."""
+    return DOMAIN_ID
+
+
+@pytest.fixture(scope="session")
+def constant_Y() -> np.ndarray:
+    """The covariance that the tests' model always predicts, reading side."""
+    A = np.random.default_rng(7).normal(size=(6, 6)) * np.repeat([4e-3, 1e-3], 3)[:, None]
+    return A @ A.T + np.diag(np.repeat([1e-6, 1e-7], 3))
+
+
+@pytest.fixture(scope="session")
+def model_path(tmp_path_factory: pytest.TempPathFactory, constant_Y: np.ndarray) -> Path:
+    """A model of one example."""
+    path = tmp_path_factory.mktemp("model") / "constant.npz"
+    save_model(constant_model(constant_Y, 704), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def node(
+    tmp_path_factory: pytest.TempPathFactory, domain_id: int, model_path: Path
+) -> Iterator[NodeProcess]:
+    """A node that serves a whole module; it must live to the end and leave with status 0."""
+    pytest.importorskip("rclpy")
+    log = tmp_path_factory.mktemp("node") / "log.txt"
+    parameters = {"node.model": model_path, "node.odometry_timeout_s": 0.3}
+    with NodeProcess(log, domain_id, parameters) as process:
+        yield process
+        process.check()
+        assert process.stop() == 0
+        assert "Traceback" not in process.output()
+
+
+@pytest.fixture(scope="module")
+def player(node: NodeProcess, domain_id: int) -> Iterator[Any]:
+    """The other side of the graph."""
+    replay = pytest.importorskip("cello3d_ros.ros.replay", exc_type=ImportError)
+    player = replay.Player(domain_id, check=node.check)
+    yield player
+    player.close()
+
+
+@pytest.fixture(scope="module")
+def _robot(player: Any) -> Robot:
+    robot = Robot(player)
+    player.connect(robot.stamp_ns, robot.pose(), 60.0)
+    return robot
+
+
+@pytest.fixture
+def robot(_robot: Robot) -> Iterator[Robot]:
+    """A robot whose last scan is the reference; what it heard is checked in the end."""
+    _robot.walk(2)
+    yield _robot
+    _robot.assert_sane()

@@ -42,7 +42,8 @@ def test_a_cloud_waits_for_its_odometry_and_then_comes_out_with_it() -> None:
     assert intake.take() == (None, [])
     buffer.add(2 * S, np.eye(4))
     taken, skips = intake.take()
-    assert taken is not None and taken.stamp_ns == S + S // 2
+    assert taken is not None
+    assert taken.stamp_ns == S + S // 2
     np.testing.assert_array_equal(taken.T_odom_base, np.eye(4))
     assert (skips, len(intake)) == ([], 0)
 
@@ -52,7 +53,8 @@ def test_the_newest_cloud_wins_and_the_older_is_counted() -> None:
     intake.offer(job(S))
     intake.offer(job(2 * S))
     taken, skips = intake.take()
-    assert taken is not None and taken.stamp_ns == 2 * S
+    assert taken is not None
+    assert taken.stamp_ns == 2 * S
     assert [(skip.stamp_ns, skip.reason) for skip in skips] == [(S, "superseded")]
 
 
@@ -61,7 +63,8 @@ def test_a_newer_cloud_without_odometry_does_not_hold_up_the_older() -> None:
     intake.offer(job(S))
     intake.offer(job(2 * S))
     taken, skips = intake.take()
-    assert taken is not None and taken.stamp_ns == S
+    assert taken is not None
+    assert taken.stamp_ns == S
     assert (skips, len(intake)) == ([], 1)
 
 
@@ -91,7 +94,8 @@ def test_a_cloud_older_than_all_odometry_is_skipped_at_once() -> None:
     intake = Intake(odometry(5 * S))
     intake.offer(job(S))
     taken, skips = intake.take()
-    assert taken is None and len(intake) == 0
+    assert taken is None
+    assert len(intake) == 0
     assert skips[0].reason == "no_odometry"
     assert "4.000 s newer" in skips[0].sentence
 

@@ -5,11 +5,11 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from scipy.spatial.transform import Rotation  # noqa: E402
+from scipy.spatial.transform import Rotation
 
-from cello3d_ros.geometry import se3  # noqa: E402
-from cello3d_ros.ros import messages  # noqa: E402
-from cello3d_ros.ros.odometry import OdometryError  # noqa: E402
+from cello3d_ros.geometry import se3
+from cello3d_ros.ros import messages
+from cello3d_ros.ros.odometry import OdometryError
 
 LIMITS = (1e-4, 1e-5, 900.0)
 

@@ -1,0 +1,102 @@
+"""Starting and stopping the node: parameters, model, signals."""
+
+import signal
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+from cello3d_ros.config import Config, load_config
+from cello3d_ros.ros.process import NodeDiedError, NodeProcess, shared_file
+from cello3d_ros.ros.replay import Player
+
+
+def last_words(log: Path, domain_id: int, parameters, ros_arguments=()) -> str:
+    """Start a node that must refuse: status 1, one sentence, no traceback."""
+    with NodeProcess(log, domain_id, parameters, ros_arguments) as process:
+        assert process.wait(60.0) == 1
+        lines = [line for line in process.output().splitlines() if not line.startswith("[")]
+        assert len(lines) == 1
+        assert lines[0].startswith("covariance_node: ")
+        return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("icp.trim_ratio", "1", "icp.trim_ratio must be of type float (write a decimal point"),
+        ("icp.trim_ratio", "1.5", "icp.trim_ratio must be in [0.01, 1]: 1.5"),
+        ("icp.max_iterations", "many", "icp.max_iterations must be of type int: 'many'"),
+        ("icp.error_metric", "fast", "must be one of point_to_plane, point_to_point: 'fast'"),
+        ("node.ceiling", ".nan", "node.ceiling must be in [1e-06, 1000]: nan"),
+        ("grid.n_cells", "[5, 5, 5]", "parameters grid.* must be the model's"),
+    ],
+)
+def test_a_bad_parameter_is_named_with_its_value_and_what_is_allowed(
+    tmp_path, domain_id, model_path, name, value, sentence
+) -> None:
+    words = last_words(tmp_path / "log", domain_id, {"node.model": model_path, name: value})
+    assert sentence in words
+
+
+def test_a_parameter_that_ros_cannot_parse(tmp_path, domain_id) -> None:
+    words = last_words(tmp_path / "log", domain_id, {}, ["--params-file", "/no/such.yaml"])
+    assert "cannot start with these ROS arguments" in words
+
+
+def test_a_missing_model(tmp_path, domain_id) -> None:
+    words = last_words(tmp_path / "log", domain_id, {"node.model": tmp_path / "none.npz"})
+    assert f"cannot read {tmp_path / 'none.npz'}" in words
+
+
+@pytest.mark.parametrize("n_bytes", [0, 10, 1000])
+def test_a_truncated_model(tmp_path, domain_id, model_path, n_bytes) -> None:
+    damaged = tmp_path / "damaged.npz"
+    damaged.write_bytes(model_path.read_bytes()[:n_bytes])
+    words = last_words(tmp_path / "log", domain_id, {"node.model": damaged})
+    assert str(damaged) in words
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_running_node_with_status_0(
+    tmp_path, domain_id, model_path, number
+) -> None:
+    parameters = {"node.model": model_path, "icp.trim": 0.5, "icp.trim_ratio": 0.8}
+    with NodeProcess(tmp_path / "log", domain_id, parameters) as process:
+        player = Player(domain_id, check=process.check)
+        running = player.spin_until(lambda: bool(player.replay.last_status), 60.0)
+        player.close()
+        assert running
+        process.send(number)
+        assert process.wait() == 0
+        output = process.output()
+    assert "unknown parameter icp.trim has no effect" in output
+    assert "not as the model was trained: icp.trim_ratio is 0.8, not 0.7" in output
+    assert "Traceback" not in output
+
+
+def test_a_node_that_died_is_noticed_with_its_last_words(tmp_path, domain_id) -> None:
+    with NodeProcess(tmp_path / "log", domain_id, {"node.model": "/no/model"}) as process:
+        process.wait(60.0)
+        with pytest.raises(NodeDiedError, match=r"status 1: covariance_node: cannot read /no"):
+            process.check()
+
+
+def test_the_shipped_parameter_file_is_the_default_configuration() -> None:
+    path = shared_file("config", "cello3d.yaml")
+    assert path is not None
+    assert load_config(path) == Config()
+
+
+def test_the_node_takes_the_shipped_parameter_file(tmp_path, domain_id, model_path) -> None:
+    path = shared_file("config", "cello3d.yaml")
+    arguments = ["--params-file", str(path)]
+    parameters = {"node.model": model_path}
+    with NodeProcess(tmp_path / "log", domain_id, parameters, arguments) as process:
+        player = Player(domain_id, check=process.check)
+        running = player.spin_until(lambda: bool(player.replay.last_status), 60.0)
+        player.close()
+        assert running
+        assert process.stop() == 0
+        assert "[WARN]" not in process.output()
