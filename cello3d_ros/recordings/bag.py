@@ -66,6 +66,9 @@ class BagRecording:
     ) -> None:
         self.path = Path(path)
         self._tracks: dict[str, PoseTrack] | None = None
+        with _one_sentence(self.path):
+            for file in [self.path] if self.path.is_file() else sorted(self.path.glob("*.db3")):
+                _check_length(file)
         with _one_sentence(self.path), self._reader() as reader:
             types = {c.topic: c.msgtype for c in reader.connections}
             self.topics = _choose(types, points_topic, odometry_topic, ground_truth_topic)
@@ -156,6 +159,20 @@ def _one_sentence(path: Path, where: str = "") -> Iterator[None]:
         known = isinstance(error, Cello3dError)
         text = lines[0] if known else f"cannot be read ({lines[0].rstrip('.')})"
         raise RecordingError(f"{path}: {where}{text}") from error
+
+
+def _check_length(file: Path) -> None:
+    """Refuse an SQLite file shorter than its header says: SQLite reads the rest as zeros.
+
+    Source: SQLite database file format, bytes 16-17 (page size) and 28-31 (pages), big-endian.
+    """
+    with file.open("rb") as stream:
+        head = stream.read(32)
+    if head.startswith(b"SQLite format 3\0") and len(head) == 32:
+        page = int.from_bytes(head[16:18], "big")
+        declared = (65536 if page == 1 else page) * int.from_bytes(head[28:32], "big")
+        if file.stat().st_size < declared:
+            raise RecordingError(f"{file.name} has lost its end: {declared} bytes are declared")
 
 
 def _choose(
