@@ -167,12 +167,14 @@ def nearest_one(
     y: float,
     z: float,
     bound2: float,
+    enough2: float,
     distances2: Array,
     indices: Indices,
     stack: Array,
 ) -> int:
     """Fill the neighbours of one query that are nearer than ``bound2``, squared; count them.
 
+    The search ends early once the farthest neighbour is at most ``enough2`` away, squared.
     distances2, indices: (k,), closest first; infinite and -1 where fewer are found.  stack:
     (64, 2) scratch of (node, squared distance of its box).
     """
@@ -214,7 +216,7 @@ def nearest_one(
                     distances2[j] = d2
                     indices[j] = p
                     worst = min(worst, distances2[k - 1])
-        if top == 0:
+        if top == 0 or worst <= enough2:
             return n_found
         top -= 1
         node = int(stack[top, 0])
@@ -226,7 +228,7 @@ def _nearest_many(tree: KdTree, queries: Array, distances2: Array, indices: Indi
     stack = np.empty((64, 2))
     for q in range(len(queries)):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        nearest_one(tree, x, y, z, np.inf, distances2[q], indices[q], stack)
+        nearest_one(tree, x, y, z, np.inf, -1.0, distances2[q], indices[q], stack)
 
 
 @njit(cache=True, nogil=True)
@@ -239,4 +241,4 @@ def _any_within_many(
     bound2 = np.nextafter(radius2, np.inf)  # a point at the radius itself is within
     for q in range(len(queries)):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        found[q] = nearest_one(tree, x, y, z, bound2, distance2, index, stack) > 0
+        found[q] = nearest_one(tree, x, y, z, bound2, radius2, distance2, index, stack) > 0

@@ -92,7 +92,7 @@ def _local_shape(
     vectors = np.empty((3, 3))
     for i in range(stop - start):
         x, y, z = points[start + i, 0], points[start + i, 1], points[start + i, 2]
-        nearest_one(tree, x, y, z, np.inf, distances2, indices, stack)
+        nearest_one(tree, x, y, z, np.inf, -1.0, distances2, indices, stack)
         _covariance(points, indices, x, y, z, covariance)
         _eigen(covariance, vectors)
         first, second, third = _descending(covariance)

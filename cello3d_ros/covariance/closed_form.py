@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from cello3d_ros.clouds.neighbors import Indices, nearest
+from cello3d_ros.clouds.neighbors import Indices
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.errors import RegistrationError
@@ -27,21 +27,25 @@ class ClosedForm(NamedTuple):
 
 
 def closed_form(
-    reading: Cloud, reference: Cloud, T_ref_read: Array, config: IcpConfig
+    reading: Cloud,
+    reference: Cloud,
+    T_ref_read: Array,
+    distances2: Array,
+    indices: Indices,
+    config: IcpConfig,
 ) -> ClosedForm:
     """Compute both predictors from all points of two registered clouds.
 
-    H is the point-to-plane normal matrix of the associations that ICP's rules keep.  ICP draws
+    distances2, indices: (N, k), the reading's neighbours (``Overlap``).  H is the point-to-plane
+    normal matrix of the associations that ICP's rules keep.  ICP draws
     n_reading_points of the reading's N points, so both are scaled by N / n_reading_points.
     Raises RegistrationError when the geometry leaves a direction free.
     """
-    moved = transform(T_ref_read, reading.points)
-    distances2, indices = nearest(reference.tree, moved, config.n_neighbors)
     rank = min(int(distances2.size * config.trim_ratio), distances2.size - 1)
     limit = np.partition(distances2, rank, axis=None)[rank]
     H, G = _normal_matrices(
         reading.points,
-        moved,
+        transform(T_ref_read, reading.points),
         reference.points,
         reference.normals,
         np.ascontiguousarray(T_ref_read[:3, :3]),

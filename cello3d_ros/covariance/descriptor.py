@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
 from cello3d_ros.config import GridConfig
 from cello3d_ros.geometry.se3 import Array
@@ -43,16 +47,42 @@ def describe_overlap(
     """
     n_cells = np.array(grid.n_cells)
     extent = np.array(grid.extent_m)
-    place = np.floor((points / extent + 0.5) * n_cells).astype(np.int64)
-    inside = ((place >= 0) & (place < n_cells)).all(axis=1)
-    place = place[inside]
-    cell = (place[:, 0] * n_cells[1] + place[:, 1]) * n_cells[2] + place[:, 2]
-    total = int(n_cells.prod())
-    nearest_bin = np.abs(normals[inside] @ BINS.T).argmax(axis=1)
-    histogram = np.bincount(cell * len(BINS) + nearest_bin, minlength=total * len(BINS))
-    count = np.maximum(np.bincount(cell, minlength=total), 1)
-    cells = np.empty((total, N_CELL))
-    cells[:, 0] = np.bincount(cell, planarity[inside], total) / count
-    cells[:, 1] = np.bincount(cell, cylindricality[inside], total) / count
-    cells[:, 2:] = histogram.reshape(total, len(BINS)) / count[:, None]
-    return cells.ravel()
+    sums = np.zeros((int(n_cells.prod()), N_CELL))
+    counts = np.zeros(len(sums))
+    _sum_cells(points, normals, planarity, cylindricality, n_cells, extent, BINS, sums, counts)
+    return (sums / np.maximum(counts, 1.0)[:, None]).ravel()
+
+
+@njit(cache=True, nogil=True)
+def _sum_cells(
+    points: Array,
+    normals: Array,
+    planarity: Array,
+    cylindricality: Array,
+    n_cells: NDArray[np.int64],
+    extent: Array,
+    bins: Array,
+    sums: Array,
+    counts: Array,
+) -> None:
+    """Add each point's planarity, cylindricality and nearest bin to its cell."""
+    for i in range(len(points)):
+        cell = 0
+        for a in range(3):
+            place = math.floor((points[i, a] / extent[a] + 0.5) * n_cells[a])
+            if place < 0 or place >= n_cells[a]:
+                cell = -1
+                break
+            cell = cell * n_cells[a] + place
+        if cell < 0:
+            continue
+        nearest, cosine = 0, -1.0
+        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+        for b in range(len(bins)):
+            c = abs(x * bins[b, 0] + y * bins[b, 1] + z * bins[b, 2])
+            if c > cosine:
+                nearest, cosine = b, c
+        counts[cell] += 1.0
+        sums[cell, 0] += planarity[i]
+        sums[cell, 1] += cylindricality[i]
+        sums[cell, 2 + nearest] += 1.0

@@ -53,7 +53,9 @@ def describe(
     T_ref_read: (4, 4).  Raises NoOverlapError when too little overlaps and RegistrationError
     when the geometry leaves a direction free.
     """
-    overlap = find_overlap(reading, reference, T_ref_read, pipeline.overlap.radius_m)
+    overlap = find_overlap(
+        reading, reference, T_ref_read, pipeline.overlap.radius_m, pipeline.icp.n_neighbors
+    )
     if overlap.n_points < pipeline.overlap.min_points:
         raise NoOverlapError(
             f"{overlap.n_points} overlapping points, need {pipeline.overlap.min_points}"
@@ -63,7 +65,7 @@ def describe(
             f"{overlap.ratio:.1%} of the reading overlaps the reference, need "
             f"{pipeline.overlap.min_ratio:.1%}"
         )
-    P, Q = overlap
+    P, Q = overlap.reading, overlap.reference
     T_read_ref = inverse(T_ref_read)
     points = np.vstack([reading.points[P], transform(T_read_ref, reference.points[Q])])
     normals = np.vstack([reading.normals[P], reference.normals[Q] @ T_read_ref[:3, :3].T])
@@ -73,7 +75,9 @@ def describe(
         describe_overlap(points @ Rz.T, normals @ Rz.T, planarity, cylindricality, pipeline.grid)
         for Rz in turns(n_rotations)
     ]
-    shapes = closed_form(reading, reference, T_ref_read, pipeline.icp)._asdict()
+    shapes = closed_form(
+        reading, reference, T_ref_read, overlap.distances2, overlap.indices, pipeline.icp
+    )._asdict()
     return Description(overlap.n_points, overlap.ratio, np.array(descriptors), shapes)
 
 

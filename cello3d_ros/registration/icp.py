@@ -214,7 +214,7 @@ def _search(moved: Array, tree: KdTree, cap2: float, distances2: Array, indices:
                 dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
                 farthest2 = max(farthest2, dx * dx + dy * dy + dz * dz)
             bound2 = min(bound2, np.nextafter(farthest2, np.inf))
-        n_found += nearest_one(tree, x, y, z, bound2, distances2[i], indices[i], stack)
+        n_found += nearest_one(tree, x, y, z, bound2, -1.0, distances2[i], indices[i], stack)
     return n_found
 
 

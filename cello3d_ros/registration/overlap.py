@@ -7,19 +7,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cello3d_ros.clouds.neighbors import any_within
+from cello3d_ros.clouds.neighbors import Indices, any_within, nearest
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.geometry.se3 import Array, inverse, transform
 
 
 class Overlap(NamedTuple):
-    """Points of each cloud that have a neighbour in the other.
+    """How two registered clouds meet.
 
-    reading: (N,) and reference: (M,), true where a point overlaps.
+    reading: (N,) and reference: (M,), true where a point has a neighbour in the other cloud;
+    distances2, indices: (N, k), squared distances and indices of each reading point's k nearest
+    reference points, closest first.
     """
 
     reading: NDArray[np.bool_]
     reference: NDArray[np.bool_]
+    distances2: Array
+    indices: Indices
 
     @property
     def n_points(self) -> int:
@@ -32,12 +36,19 @@ class Overlap(NamedTuple):
         return float(self.reading.mean())
 
 
-def find_overlap(reading: Cloud, reference: Cloud, T_ref_read: Array, radius_m: float) -> Overlap:
+def find_overlap(
+    reading: Cloud, reference: Cloud, T_ref_read: Array, radius_m: float, k: int = 1
+) -> Overlap:
     """Return the points of two clouds that are at most ``radius_m`` from the other cloud.
 
     T_ref_read: (4, 4), p_ref = T_ref_read p_read.  Source: S of Sec. IV-C.
     """
+    moved = transform(T_ref_read, reading.points)
+    distances2, indices = nearest(reference.tree, moved, k)
+    back = transform(inverse(T_ref_read), reference.points)
     return Overlap(
-        any_within(reference.tree, transform(T_ref_read, reading.points), radius_m),
-        any_within(reading.tree, transform(inverse(T_ref_read), reference.points), radius_m),
+        distances2[:, 0] <= radius_m**2,
+        any_within(reading.tree, back, radius_m),
+        distances2,
+        indices,
     )
