@@ -104,7 +104,7 @@ class SamplingConfig(Section):
     cluster_scale_rad: float = _setting(0.05, "rotation that counts as one radius", 1e-6)
     n_rotations: int = _setting(4, "turns about z of each example, 1 is none", 1, 64)
     cluster_min_share: float = _setting(
-        0.01, "share of the samples within one radius that makes a core point", 0.0, 1.0
+        0.002, "share of the samples within one radius that makes a core point", 0.0, 1.0
     )
 
 

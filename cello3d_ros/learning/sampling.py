@@ -12,7 +12,7 @@ from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import Pipeline, SamplingConfig
 from cello3d_ros.covariance.estimator import describe
 from cello3d_ros.errors import CloudError, NoOverlapError, RecordingError, RegistrationError
-from cello3d_ros.geometry.gaussian import sampled_covariance
+from cello3d_ros.geometry.gaussian import is_positive_definite, sampled_covariance
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log
 from cello3d_ros.learning.clustering import nearest_cluster, offset
 from cello3d_ros.learning.dataset import PairRecord
@@ -114,6 +114,8 @@ def _judged(record: PairRecord, sampling: SamplingConfig) -> PairRecord:
     if kept.sum() < _FEWEST_KEPT:
         return replace(record, kept=kept, reason="no_cluster")
     Y = sampled_covariance(record.xi[kept])
+    if not all(is_positive_definite(matrix) for matrix in (Y, *record.shapes.values())):
+        return replace(record, kept=kept, reason="singular")
     return replace(record, kept=kept, covariance=Y, accepted=True, reason="")
 
 
