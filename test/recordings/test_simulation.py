@@ -41,6 +41,26 @@ def test_a_longer_simulation_starts_with_the_shorter_one() -> None:
         assert np.array_equal(a.T_odom_sensor, b.T_odom_sensor)
 
 
+def test_another_seed_changes_scans_path_and_odometry() -> None:
+    pytest.importorskip("open3d")
+    first, second = (list(simulate("hall", seed, 3, COARSE)) for seed in (0, 1))
+    for a, b in zip(first, second, strict=True):
+        assert a.points.shape != b.points.shape or not np.allclose(a.points, b.points)
+        assert np.abs(a.T_world_sensor - b.T_world_sensor).max() > 1e-3
+    assert np.abs(first[2].T_odom_sensor - second[2].T_odom_sensor).max() > 1e-3
+
+
+@pytest.mark.parametrize("world", ["garden", "wood"])
+def test_no_foliage_hangs_into_the_way(world: str) -> None:
+    built = build_world(world, np.random.default_rng(3))
+    corners = built.mesh.vertices[built.mesh.triangles]
+    middles = corners[np.ptp(corners, axis=1).max(axis=1) < 0.3].mean(axis=1)
+    distance, nearest = built.route.nearest(middles[:, :2])
+    above = middles[:, 2] - built.route.points[nearest, 2]
+    assert not ((distance < 0.55) & (above > 0.4) & (above < 2.3)).any()
+    assert ((distance < 3.0) & (above > 0.4)).sum() > 50  # but there is some beside it
+
+
 @pytest.mark.parametrize("world", WORLDS)
 def test_another_seed_builds_another_layout_of_another_size(world: str) -> None:
     meshes = [build_world(world, np.random.default_rng(seed)).mesh for seed in (0, 1)]
