@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from cello3d_ros.errors import RecordingError
-from cello3d_ros.recordings import indoor, outdoor
+from cello3d_ros.recordings import indoor, outdoor, staircase
 from cello3d_ros.recordings.meshes import Mesh
 from cello3d_ros.recordings.paths import Route
 
@@ -30,7 +30,7 @@ WORLDS: MappingProxyType[str, Builder] = MappingProxyType(
         "rooms": indoor.rooms,
         "hall": indoor.hall,
         "corridor": indoor.corridor,
-        "stairs": indoor.stairs,
+        "stairs": staircase.stairs,
         "garden": outdoor.garden,
         "wood": outdoor.wood,
     }
