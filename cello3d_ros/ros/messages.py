@@ -13,6 +13,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.gaussian import symmetrized, to_fixed_axes
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.ros.odometry import checked_pose
 
@@ -91,8 +92,7 @@ def ros_covariance(
     """
     if np.shape(Y) != (6, 6) or not np.isfinite(Y).all():
         raise CovarianceError("the covariance is not finite")
-    B = np.kron(np.eye(2), R_header_read)
-    C = _symmetric(B @ Y @ B.T)
+    C = to_fixed_axes(R_header_read, Y)
     unit = np.repeat([floor_sigma_m, floor_sigma_rad], 3)
     unit2 = np.outer(unit, unit)
     C = unit2 * _clamped(C / unit2, 1.0, np.inf)
@@ -102,8 +102,7 @@ def ros_covariance(
 
 def reading_covariance(C: Array, R_header_read: Array) -> Array:
     """Return the reading-side covariance of a PoseWithCovariance's: ``Y = B^T C B``.  (6, 6)."""
-    B = np.kron(np.eye(2), R_header_read)
-    return _symmetric(B.T @ np.asarray(C, dtype=np.float64).reshape(6, 6) @ B)
+    return to_fixed_axes(np.transpose(R_header_read), np.reshape(C, (6, 6)))
 
 
 def pose_with_covariance(
@@ -121,13 +120,9 @@ def pose_with_covariance(
     return message
 
 
-def _symmetric(A: Array) -> Array:
-    return np.asarray(0.5 * (A + A.T))
-
-
 def _clamped(A: Array, low: float, high: float) -> Array:
     """Return a symmetric matrix with its eigenvalues moved into [low, high]."""
     values, vectors = np.linalg.eigh(A)
     if low <= values[0] and values[-1] <= high:
-        return _symmetric(A)
-    return _symmetric((vectors * np.clip(values, low, high)) @ vectors.T)
+        return symmetrized(A)
+    return symmetrized((vectors * np.clip(values, low, high)) @ vectors.T)
