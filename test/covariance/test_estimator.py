@@ -1,0 +1,120 @@
+import numpy as np
+import pytest
+
+from cello3d_ros.clouds.shape import prepare
+from cello3d_ros.config import GridConfig, IcpConfig, OverlapConfig, Pipeline
+from cello3d_ros.covariance.estimator import describe, estimate, turns
+from cello3d_ros.covariance.model import constant_model
+from cello3d_ros.errors import ModelError, NoOverlapError, RegistrationError
+from cello3d_ros.geometry.gaussian import is_positive_definite
+from cello3d_ros.geometry.se3 import exp, inverse, log, transform
+
+PIPELINE = Pipeline()
+T_TRUE = exp([0.6, -0.4, 0.1, 0.02, -0.03, 0.4])
+
+
+@pytest.fixture
+def pair(room):
+    rng = np.random.default_rng(0)
+    reading = transform(inverse(T_TRUE), room[0])
+    return prepare(reading, PIPELINE.cloud, rng), prepare(room[1], PIPELINE.cloud, rng)
+
+
+def moved(cloud, T):
+    """Express a cloud in another frame without choosing other points."""
+    points = transform(T, cloud.points)
+    tree = cloud.tree  # its boxes are axis-aligned: rebuild
+    from cello3d_ros.clouds.neighbors import build_tree
+
+    tree = build_tree(points)
+    order = tree.order
+    return cloud._replace(
+        points=tree.points,
+        normals=cloud.normals[order] @ T[:3, :3].T,
+        planarity=cloud.planarity[order],
+        cylindricality=cloud.cylindricality[order],
+        tree=tree._replace(order=np.arange(len(order))),
+    )
+
+
+def test_the_description_does_not_depend_on_the_frame_of_the_reference(pair):
+    reading, reference = pair
+    A = exp([3.0, -2.0, 1.0, 0.3, 0.4, 2.0])
+    here = describe(reading, reference, T_TRUE, PIPELINE)
+    there = describe(reading, moved(reference, A), A @ T_TRUE, PIPELINE)
+    np.testing.assert_allclose(here.descriptors, there.descriptors, atol=2e-3)
+    assert np.abs(here.descriptors).max() > 0.5
+    for name in ("hessian", "sandwich"):
+        scale = np.sqrt(np.diag(here.shapes[name]))
+        np.testing.assert_allclose(
+            here.shapes[name] / np.outer(scale, scale),
+            there.shapes[name] / np.outer(scale, scale),
+            atol=1e-2,
+        )
+
+
+def test_a_turned_description_is_that_of_turned_clouds(pair):
+    """P -> RP, Q -> RQ, T -> R T R^-1; the paper's augmentation."""
+    reading, reference = pair
+    n = 3
+    R = np.eye(4)
+    R[:3, :3] = turns(n)[1]
+    one = describe(reading, reference, T_TRUE, PIPELINE, n)
+    other = describe(moved(reading, R), moved(reference, R), R @ T_TRUE @ inverse(R), PIPELINE)
+    np.testing.assert_allclose(one.descriptors[1], other.descriptors[0], atol=2e-3)
+    assert np.abs(one.descriptors[1] - one.descriptors[0]).max() > 0.1
+
+
+def test_an_estimate_registers_and_predicts(pair):
+    reading, reference = pair
+    model = constant_model(2.0 * np.eye(6), 704, shape="sandwich")
+    found = estimate(
+        reading, reference, T_TRUE @ exp([0.05] * 6), model, PIPELINE, np.random.default_rng(1)
+    )
+    assert found.registration.converged
+    assert np.linalg.norm(log(inverse(T_TRUE) @ found.registration.T_ref_read)) < 0.03
+    assert found.overlap_ratio > 0.7
+    assert found.effective_neighbors == 1.0
+    S = describe(reading, reference, found.registration.T_ref_read, PIPELINE).shapes["sandwich"]
+    np.testing.assert_allclose(found.covariance, 2.0 * S, rtol=1e-6, atol=1e-16)
+    assert is_positive_definite(found.covariance)
+
+
+def test_clouds_that_share_too_little_are_an_error(pair):
+    reading, reference = pair
+    with pytest.raises(NoOverlapError, match="overlap"):
+        describe(reading, reference, exp([40.0, 0, 0, 0, 0, 0]), PIPELINE)
+    strict = Pipeline(overlap=OverlapConfig(radius_m=0.02, min_ratio=0.9))
+    with pytest.raises(NoOverlapError, match="of the reading overlaps"):
+        describe(reading, reference, T_TRUE, strict)
+
+
+def test_an_unconverged_registration_says_so(pair):
+    reading, reference = pair
+    hasty = Pipeline(icp=IcpConfig(max_iterations=1))
+    model = constant_model(np.eye(6), 704)
+    found = estimate(reading, reference, T_TRUE, model, hasty, np.random.default_rng(1))
+    assert not found.registration.converged
+    assert found.registration.reason == "max_iterations"
+
+
+def test_a_plane_has_no_answer():
+    rng = np.random.default_rng(3)
+    ground = rng.uniform(-8, 8, (4000, 3)) * [1, 1, 0] - [0, 0, 1.5]
+    cloud = prepare(ground, PIPELINE.cloud, rng)
+    with pytest.raises(RegistrationError, match="singular|direction free"):
+        estimate(cloud, cloud, np.eye(4), constant_model(np.eye(6), 704), PIPELINE, rng)
+
+
+def test_another_grid_than_the_models_is_refused(pair):
+    reading, reference = pair
+    other = Pipeline(grid=GridConfig(n_cells=(2, 2, 2)))
+    with pytest.raises(ModelError, match="trained with GridConfig"):
+        estimate(
+            reading,
+            reference,
+            T_TRUE,
+            constant_model(np.eye(6), 704),
+            other,
+            np.random.default_rng(0),
+        )
