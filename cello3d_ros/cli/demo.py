@@ -40,6 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rate", type=float, metavar="HZ", help="clouds a second (each waits for the answer)"
     )
+    parser.add_argument(
+        *("-p", "--param"),
+        action="append",
+        default=[],
+        metavar="NAME:=VALUE",
+        help="parameter of the node; may be repeated",
+    )
     parser.add_argument("--domain-id", type=int, help="ROS domain of the demo (one of its own)")
 
 
@@ -226,8 +233,10 @@ def _replay(
         from cello3d_ros.ros.replay import Player
     except ImportError as error:
         raise Cello3dError(f"{_ROS_IS_MISSING} ({error})") from None
-    model = {} if arguments.model is None else {"node.model": arguments.model.resolve()}
-    with NodeProcess(arguments.out / "node.log", domain_id, model) as node:
+    given = [word for text in arguments.param for word in ("-p", text)]
+    if arguments.model is not None:
+        given += ["-p", f"node.model:={arguments.model.resolve()}"]
+    with NodeProcess(arguments.out / "node.log", domain_id, ros_arguments=given) as node:
         player = Player(domain_id, check=node.check)
         try:
             complaint = _play(player, recording, arguments.rate)

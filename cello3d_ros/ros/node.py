@@ -156,6 +156,8 @@ class CovarianceNode(Node):
             return Skip(stamp_ns, "future_stamp", str(error))
         except CloudError as error:
             return Skip(stamp_ns, "malformed", str(error))
+        except Exception as error:  # whatever bytes may do, the node outlives them
+            return Skip(stamp_ns, "malformed", f"{type(error).__name__}: {error}")
         order = stamp_order(stamp_ns, self._newest_cloud_ns)
         if order == "jump":
             self._forget(stamp_ns)

@@ -62,7 +62,9 @@ def cello3d(*arguments: object, code: str = "") -> subprocess.CompletedProcess[s
 
 def test_every_pair_of_a_bag_is_answered_and_judged(tmp_path, bag, model) -> None:
     pytest.importorskip("rclpy")
-    done = cello3d("demo", "--recording", bag, "--out", tmp_path / "out", "--model", model)
+    out = tmp_path / "out"
+    more = ("-p", "node.seed:=3")
+    done = cello3d("demo", "--recording", bag, "--out", out, "--model", model, *more)
     assert done.returncode == 0, done.stderr
     assert "5 of 5" in done.stdout
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())

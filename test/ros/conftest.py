@@ -141,15 +141,16 @@ def player(node: NodeProcess, domain_id: int) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def _robot(player: Any) -> Robot:
+def lone_robot(player: Any) -> Robot:
+    """A robot that has not taken a step."""
     robot = Robot(player)
     player.connect(robot.stamp_ns, robot.pose(), 60.0)
     return robot
 
 
 @pytest.fixture
-def robot(_robot: Robot) -> Iterator[Robot]:
+def robot(lone_robot: Robot) -> Iterator[Robot]:
     """A robot whose last scan is the reference; what it heard is checked in the end."""
-    _robot.walk(2)
-    yield _robot
-    _robot.assert_sane()
+    lone_robot.walk(2)
+    yield lone_robot
+    lone_robot.assert_sane()

@@ -78,6 +78,10 @@ def _point_step_0(message) -> None:
     message.point_step = 0
 
 
+def _absurd_point_step(message) -> None:
+    message.point_step = 2**32 - 1
+
+
 def _integers(message) -> None:
     message.fields[0].datatype = 5
 
@@ -89,6 +93,7 @@ def _integers(message) -> None:
         (_no_z, "no field 'z'"),
         (_unknown_datatype, "unknown datatype 99"),
         (_point_step_0, "beyond point_step 0"),
+        (_absurd_point_step, ""),
         (_integers, "expected a float"),
     ],
 )

@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("rclpy")
 
 from cello3d_ros.config import Config, load_config
+from cello3d_ros.ros import parameter_file
 from cello3d_ros.ros.process import NodeDiedError, NodeProcess, shared_file
 from cello3d_ros.ros.replay import Player
 
@@ -87,6 +88,9 @@ def test_the_shipped_parameter_file_is_the_default_configuration() -> None:
     path = shared_file("config", "cello3d.yaml")
     assert path is not None
     assert load_config(path) == Config()
+    assert path.read_text() == parameter_file.text(), (
+        "run python -m cello3d_ros.ros.parameter_file > config/cello3d.yaml"
+    )
 
 
 def test_the_node_takes_the_shipped_parameter_file(tmp_path, domain_id, model_path) -> None:
