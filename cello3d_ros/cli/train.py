@@ -16,7 +16,7 @@ from cello3d_ros.errors import Cello3dError, DatasetError
 
 if TYPE_CHECKING:
     from cello3d_ros.learning.dataset import Dataset
-    from cello3d_ros.learning.training import Figures
+    from cello3d_ros.learning.evaluation import Figures
 
 _COLUMNS = (  # heading, figure
     ("KL mean", "kl_mean"),
@@ -65,7 +65,8 @@ def run(arguments: argparse.Namespace) -> None:
     """Train, write the model and print how good it is on recordings that it has not seen."""
     from cello3d_ros.covariance.model import save_model
     from cello3d_ros.learning.dataset import open_dataset
-    from cello3d_ros.learning.training import load_examples, train
+    from cello3d_ros.learning.examples import load_examples
+    from cello3d_ros.learning.training import train
 
     config = _settings(arguments)
     _check_writable(arguments.out)

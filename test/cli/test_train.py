@@ -13,7 +13,7 @@ from cello3d_ros.config import Pipeline, SamplingConfig
 from cello3d_ros.covariance.model import load_model
 from cello3d_ros.errors import Cello3dError, DatasetError
 from cello3d_ros.learning.dataset import PairRecord, open_dataset
-from cello3d_ros.learning.training import load_examples
+from cello3d_ros.learning.examples import load_examples
 
 
 def fill(path: Path, names: list[str], seed: int = 0, **settings: object) -> Path:

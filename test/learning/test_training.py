@@ -14,15 +14,9 @@ from cello3d_ros.errors import DatasetError
 from cello3d_ros.geometry.gaussian import is_positive_definite, kl, matrix_sqrt
 from cello3d_ros.geometry.se3 import Array, adjoint, exp
 from cello3d_ros.learning.dataset import Dataset, PairRecord, open_dataset
-from cello3d_ros.learning.training import (
-    Examples,
-    Problem,
-    leave_out_problem,
-    load_examples,
-    loss_and_gradient,
-    predicted,
-    train,
-)
+from cello3d_ros.learning.examples import Examples, load_examples
+from cello3d_ros.learning.loss import Problem, leave_out_problem, loss_and_gradient, predicted
+from cello3d_ros.learning.training import train
 
 PAPER = TrainingConfig(shape="none", theta="diagonal", mean_weight=0.0, regularization=1e-3)
 SIZE = np.diag([1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2])  # det of SIZE SIZE^T is 1e-24

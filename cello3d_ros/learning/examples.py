@@ -1,0 +1,181 @@
+"""What a model is trained on: the accepted pairs of some recordings, and their turned copies.
+
+Covariances are packed as their upper triangles, 21 numbers, where many are summed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cello3d_ros.config import Pipeline, SamplingConfig, differences
+from cello3d_ros.errors import DatasetError
+from cello3d_ros.geometry.gaussian import matrix_inverse_sqrt, matrix_sqrt, symmetrized
+from cello3d_ros.geometry.se3 import Array, adjoint, exp
+from cello3d_ros.learning.dataset import Dataset, PairRecord
+
+Indices = NDArray[np.intp]
+
+_FREE = ("seed", "n_samples", "max_gap")  # sampling settings in which datasets may differ
+_ROWS, _COLUMNS = np.triu_indices(6)
+_MAX_SAMPLES = 200  # errors of each pair kept for the coverage
+
+#: (21,) how often each packed number stands in its matrix: ``tr(A B) = (A * TWICE) @ B``, packed.
+TWICE: Array = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Examples:
+    """Accepted pairs of some recordings; nothing is relative or turned yet but the features.
+
+    features: (N, n_rotations, D) descriptors of the pair turned about z by ``rotations_rad``.
+    covariances: (N, 6, 6).  groups: (N,) names of recordings.  shapes: name -> (N, 6, 6).
+    xi: N arrays (n, 6), some of the errors that made each covariance.
+    """
+
+    features: NDArray[np.float32]
+    covariances: Array
+    groups: NDArray[np.str_]
+    shapes: dict[str, Array]
+    rotations_rad: Array
+    xi: tuple[Array, ...] = ()
+    rejected: dict[str, int] = dataclasses.field(default_factory=dict)  # reason -> pairs
+    pipeline: Pipeline = dataclasses.field(default_factory=Pipeline)
+    sampling: SamplingConfig = dataclasses.field(default_factory=SamplingConfig)
+
+    @property
+    def n_pairs(self) -> dict[str, int]:
+        """Accepted pairs of each recording."""
+        return dict(sorted(Counter(self.groups.tolist()).items()))
+
+
+def load_examples(datasets: Sequence[Dataset], recordings: Iterable[str]) -> Examples:
+    """Read the accepted pairs of the named recordings.
+
+    Raises DatasetError where datasets were made with different settings, share a pair, hold a
+    damaged pair, or have no accepted pair of these recordings.
+    """
+    for other in datasets[1:]:
+        _check_alike(datasets[0], other)
+    wanted = set(recordings)
+    records: dict[tuple[str, int, int], PairRecord] = {}
+    for dataset in datasets:
+        for key in dataset.pair_keys():
+            if key[0] in wanted:
+                if key in records:
+                    raise DatasetError(f"{dataset.path} repeats the pair {key} of another dataset")
+                records[key] = _slim(dataset.read(*key))
+    return _stacked([records[key] for key in sorted(records)], datasets[0])
+
+
+def to_relative(examples: Examples, shape: str) -> Array:
+    """Return ``S^-1/2 Y S^-1/2`` of every pair, or Y if the shape is none."""
+    if shape == "none":
+        return examples.covariances
+    try:
+        root = matrix_inverse_sqrt(examples.shapes[shape])
+    except np.linalg.LinAlgError:
+        raise DatasetError(f"the {shape} of a pair is singular to rounding") from None
+    except KeyError:
+        raise DatasetError(f"the dataset does not hold the {shape} of each pair") from None
+    return symmetrized(root @ examples.covariances @ root)
+
+
+def to_absolute(relative: Array, examples: Examples, shape: str) -> Array:
+    if shape == "none":
+        return relative
+    root = matrix_sqrt(examples.shapes[shape])
+    return symmetrized(root @ relative @ root)
+
+
+def turn(Y: Array, rotations_rad: Array) -> Array:
+    """Return ``Ad_R Y Ad_R^T`` for each turn R about z of the reading frame.
+
+    A shape turns with its covariance, so what is relative turns the same way.
+    (N, 6, 6), (R,) -> (N R, 6, 6), the turns of a pair side by side.
+    """
+    xi = np.zeros((len(rotations_rad), 6))
+    xi[:, 5] = rotations_rad
+    Ad = adjoint(exp(xi))
+    return symmetrized(Ad @ Y[:, None] @ np.swapaxes(Ad, 1, 2)).reshape(-1, 6, 6)
+
+
+def flat_features(examples: Examples) -> Array:
+    """Return the features of every pair and turn.  (N n_rotations, D) in float64."""
+    return examples.features.reshape(-1, examples.features.shape[-1]).astype(np.float64)
+
+
+def unturned_rows(examples: Examples) -> slice:
+    """Return which rows of ``flat_features`` are pairs as they were recorded."""
+    turns = np.flatnonzero(examples.rotations_rad == 0.0)
+    if len(turns) == 0:
+        raise DatasetError("the dataset holds turned descriptors only, none at 0 rad")
+    return slice(int(turns[0]), None, len(examples.rotations_rad))
+
+
+def feature_scaler(examples: Examples) -> tuple[Array, Array, Indices]:
+    """Return mean and scale (1 for constants) of the features, and which of them vary."""
+    X = flat_features(examples)
+    mean, std = X.mean(axis=0), X.std(axis=0)
+    varies = std > 1e-6 * (np.abs(mean) + 1e-6)
+    return mean, np.where(varies, std, 1.0), np.flatnonzero(varies)
+
+
+def pack(Y: Array) -> Array:
+    """Return the upper triangles.  (..., 6, 6) -> (..., 21)."""
+    return np.ascontiguousarray(Y[..., _ROWS, _COLUMNS])
+
+
+def unpack(packed: Array) -> Array:
+    Y = np.empty((*packed.shape[:-1], 6, 6))
+    Y[..., _ROWS, _COLUMNS] = packed
+    Y[..., _COLUMNS, _ROWS] = packed
+    return Y
+
+
+def _check_alike(ours: Dataset, theirs: Dataset) -> None:
+    """Raise DatasetError naming the first setting in which two datasets differ."""
+    found = differences(theirs.pipeline, ours.pipeline)
+    a, b = dataclasses.asdict(theirs.sampling), dataclasses.asdict(ours.sampling)
+    found += [
+        f"sampling.{name} is {value}, not {b[name]}"
+        for name, value in a.items()
+        if value != b[name] and name not in _FREE
+    ]
+    if found:
+        raise DatasetError(f"{theirs.path} does not go with {ours.path}: {found[0]}")
+
+
+def _slim(record: PairRecord) -> PairRecord:
+    """Return the record with at most 200 errors, evenly spaced, of those that were kept."""
+    kept = record.xi[record.kept]
+    return dataclasses.replace(record, xi=kept[:: -(-len(kept) // _MAX_SAMPLES) or 1])
+
+
+def _stacked(records: list[PairRecord], dataset: Dataset) -> Examples:
+    """Return the accepted of some records of datasets with the settings of ``dataset``."""
+    accepted = [record for record in records if record.accepted]
+    if not accepted:
+        raise DatasetError(f"{dataset.path}: no accepted pair among {len(records)}")
+    first = accepted[0]
+    for record in accepted:
+        same_turns = np.array_equal(record.rotations_rad, first.rotations_rad)
+        if record.descriptors.shape != first.descriptors.shape or not same_turns:
+            raise DatasetError(f"pairs {first.key} and {record.key} have unlike descriptors")
+    names = set.intersection(*(set(record.shapes) for record in accepted))
+    return Examples(
+        features=np.array([record.descriptors for record in accepted]),
+        covariances=np.array([record.covariance for record in accepted]),
+        groups=np.array([record.recording for record in accepted]),
+        shapes={n: np.array([record.shapes[n] for record in accepted]) for n in sorted(names)},
+        rotations_rad=first.rotations_rad,
+        xi=tuple(record.xi for record in accepted),
+        rejected=dict(sorted(Counter(r.reason for r in records if not r.accepted).items())),
+        pipeline=dataset.pipeline,
+        sampling=dataset.sampling,
+    )
