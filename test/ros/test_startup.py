@@ -1,16 +1,20 @@
 """Starting and stopping the node: parameters, model, signals."""
 
+import math
 import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
 
 from cello3d_ros.config import Config, load_config
+from cello3d_ros.geometry import se3
 from cello3d_ros.ros import parameter_file
 from cello3d_ros.ros.process import NodeDiedError, NodeProcess, shared_file
 from cello3d_ros.ros.replay import Player
+from cello3d_ros.ros.warmup import room
 
 
 def last_words(log: Path, domain_id: int, parameters, ros_arguments=()) -> str:
@@ -104,3 +108,29 @@ def test_the_node_takes_the_shipped_parameter_file(tmp_path, domain_id, model_pa
         assert running
         assert process.stop() == 0
         assert "[WARN]" not in process.output()
+
+
+def test_the_sensor_may_sit_anywhere_on_the_base(tmp_path, domain_id, model_path) -> None:
+    quarter = [0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4)]
+    T_base_sensor = se3.pose([0.4, -0.2, 1.0], quarter)
+    parameters = {
+        "node.model": model_path,
+        "node.T_base_sensor": f"[0.4, -0.2, 1.0, 0.0, 0.0, {quarter[2]}, {quarter[3]}]",
+    }
+    rng = np.random.default_rng(0)
+    poses = [se3.exp([0.2 * i, 0.1, 0.0, 0.0, 0.0, 0.9 * i]) for i in range(3)]  # of the base
+    points = room(rng)
+    with NodeProcess(tmp_path / "log", domain_id, parameters) as process:
+        player = Player(domain_id, check=process.check)
+        player.connect(10**18, poses[0], 60.0)
+        for i, T in enumerate(poses):
+            stamp_ns = 10**18 + i * 10**8
+            player.publish_odometry(stamp_ns, T)
+            seen = se3.transform(se3.inverse(T @ T_base_sensor), points)
+            player.publish_cloud(stamp_ns, seen)
+            assert player.spin_until(lambda s=stamp_ns: player.replay.is_settled(s), 20.0)
+        player.close()
+    assert len(player.replay.poses) == 2
+    np.testing.assert_allclose(
+        player.replay.poses[stamp_ns].T, poses[-1] @ T_base_sensor, atol=0.02
+    )
