@@ -122,8 +122,8 @@ class TrainingConfig(Section):
     )
     rank: int = _setting(16, "rows of a low-rank Theta", 1, 10000)
     loss: str = _setting("log_det", "paper is the printed det F", choices=("log_det", "paper"))
-    regularization: float = _setting(0.01, "lambda of lambda |Theta|^2", 0.0)
-    mean_weight: float = _setting(0.05, "share of the training mean in a prediction", 0.0, 1.0)
+    regularization: float = _setting(0.03, "lambda of lambda |Theta|^2", 0.0)
+    mean_weight: float = _setting(0.15, "share of the training mean in a prediction", 0.0, 1.0)
     max_iterations: int = _setting(100, "optimiser steps", 1)
     seed: int = _setting(0, "seed of the initial Theta", 0)
 
