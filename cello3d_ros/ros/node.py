@@ -10,6 +10,7 @@ not be fused as if they were independent.  Nothing is published for a cloud with
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import signal
@@ -184,6 +185,8 @@ class CovarianceNode(Node):
         except Cello3dError as error:
             self._skip(Skip(job.stamp_ns, reason_of(error), str(error)))
         except Exception as error:  # a node that dies of one cloud is worse than a lost answer
+            if not self.context.ok():
+                raise
             self.get_logger().error(traceback.format_exc())
             self._skip(Skip(job.stamp_ns, "internal", f"{type(error).__name__}: {error}"))
         self._publish_diagnostics()
@@ -274,18 +277,36 @@ class CovarianceNode(Node):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until it is told to stop; the return value is the exit status."""
-    signal.signal(signal.SIGTERM, _interrupt)
+    is_starting = True
+
+    def stop(*_: Any) -> None:  # once the node spins, rclpy's own handler ends it
+        nonlocal is_starting
+        if is_starting:
+            is_starting = False
+            raise KeyboardInterrupt
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
     try:
         _initialise(args)
         node = CovarianceNode()
+        is_starting = False
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        return 0
     except Cello3dError as error:
         print(f"{NAME}: {error}", file=sys.stderr)
         return 1
+    except RuntimeError:  # what rclpy raises when a signal has ended its context in mid-callback
+        if rclpy.ok():
+            raise
+        return 0
     finally:
-        try_shutdown()
+        is_starting = False
+        with contextlib.suppress(RuntimeError):  # rclpy's own handler may be at it, too
+            try_shutdown()
+        for number in (signal.SIGINT, signal.SIGTERM):  # impatience does not change the status
+            signal.signal(number, signal.SIG_IGN)
     return 0
 
 
@@ -295,10 +316,6 @@ def _initialise(args: Sequence[str] | None) -> None:
     except (RuntimeError, ValueError) as error:
         text = " ".join(str(error).split())
         raise ConfigError(f"cannot start with these ROS arguments: {text}") from None
-
-
-def _interrupt(*_: Any) -> None:
-    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":
