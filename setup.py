@@ -29,6 +29,7 @@ setup(
         "scipy>=1.11",
         "numba>=0.59",
         "scikit-learn>=1.3",
+        "threadpoolctl>=3.1",
         "PyYAML>=6",
         "tqdm>=4.60",
         "matplotlib>=3.6",

@@ -140,7 +140,7 @@ class NodeConfig(Section):
     odometry_timeout_s: float = _setting(0.5, "wait for odometry after a cloud's stamp", 0.0, 60.0)
     odometry_gap_s: float = _setting(1.0, "odometry farther apart is not interpolated", 0.0)
     odometry_buffer_s: float = _setting(10.0, "odometry remembered", 0.1, 3600.0)
-    max_pair_gap_s: float = _setting(5.0, "scans farther apart are not paired", 0.0)
+    max_pair_gap_s: float = _setting(10.0, "scans farther apart are not paired", 0.0)
     max_failures: int = _setting(3, "failed pairs before the reference is given up", 1)
     future_tolerance_s: float = _setting(0.5, "a cloud stamped later than now + this", 0.0)
     floor_sigma_m: float = _setting(1e-4, "smallest published standard deviation", 1e-9)

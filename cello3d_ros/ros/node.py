@@ -35,6 +35,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import try_shutdown
 from sensor_msgs.msg import PointCloud2
+from threadpoolctl import threadpool_limits
 
 from cello3d_ros.clouds.pointcloud2 import read_points
 from cello3d_ros.config import PIPELINE, Config, differences
@@ -289,9 +290,10 @@ def main(args: Sequence[str] | None = None) -> int:
         signal.signal(number, stop)
     try:
         _initialise(args)
-        node = CovarianceNode()
-        is_starting = False
-        rclpy.spin(node)
+        with threadpool_limits(1, user_api="blas"):  # its waiting threads take the kernels' cores
+            node = CovarianceNode()
+            is_starting = False
+            rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     except Cello3dError as error:
