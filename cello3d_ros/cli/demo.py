@@ -183,7 +183,7 @@ def _draw_ellipses(axes: Any, centers: Array, covariances: list[Array]) -> None:
     extent = np.ptp(centers, axis=0).max()
     largest = 6.0 * np.sqrt(max(np.linalg.eigvalsh(C)[-1] for C in covariances))
     scale = 1.0
-    while 0.0 < largest * scale < 0.02 * extent:
+    while 0.0 < largest * scale < 0.05 * extent:
         scale *= 10.0
     label = "3 sigma" if scale == 1.0 else f"3 sigma, drawn {scale:.0f} times as large"
     for i, (center, C) in enumerate(zip(centers, covariances, strict=True)):
