@@ -16,6 +16,7 @@ from cello3d_ros.errors import CloudError
 from cello3d_ros.geometry.se3 import Array
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_MAX_POINT_STEP = 2**20  # bytes of one point
 
 
 def read_points(message: Any) -> Array:
@@ -46,6 +47,8 @@ def read_fields(message: Any, names: tuple[str, ...]) -> dict[str, NDArray[Any]]
 
 def _record_type(message: Any, names: set[str]) -> np.dtype[Any]:
     """Return the structured type of one point, restricted to ``names``."""
+    if not 0 <= message.point_step <= _MAX_POINT_STEP:
+        raise CloudError(f"PointCloud2 point_step {message.point_step} is absurd")
     fields = {field.name: field for field in reversed(message.fields)}
     if missing := sorted(names - set(fields)):
         raise CloudError(

@@ -105,6 +105,7 @@ def test_trailing_bytes_are_ignored(points):
         (lambda m: setattr(m.fields[2], "datatype", 6), "expected a float"),
         (lambda m: setattr(m.fields[0], "offset", 9), "beyond point_step 12"),
         (lambda m: setattr(m, "point_step", 0), "beyond point_step 0"),
+        (lambda m: setattr(m, "point_step", 2**32 - 1), "point_step 4294967295 is absurd"),
         (lambda m: setattr(m, "row_step", 12), "row_step 12 is less than width"),
     ],
 )
