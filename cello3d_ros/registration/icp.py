@@ -52,6 +52,16 @@ class Registration(NamedTuple):
     n_associations: int
 
 
+class _Pair(NamedTuple):
+    """Two sets of points as the kernels want them: in tree order, about the reference's mean."""
+
+    reading: Array
+    reference: Array
+    normals: Array
+    leaves: Leaves
+    mean: Array
+
+
 def icp(
     reading: Array, reference: Array, normals: Array, T_init: Array, config: IcpConfig
 ) -> Registration:
@@ -61,31 +71,7 @@ def icp(
     Never raises on geometry: a registration without an answer keeps the last pose it had and
     says why.
     """
-    k = config.n_neighbors
-    if len(reading) == 0 or len(reference) < k:
-        return Registration(T_init.copy(), 0, False, REASONS[_TOO_FEW_POINTS], math.nan, 0)
-    mean = reference.mean(axis=0)
-    reading, reference = np.ascontiguousarray(reading), reference - mean
-    read, ref = tree_order(reading), tree_order(reference)
-    reference = reference[ref]
-    T = T_init.copy()
-    T[:3, 3] -= mean
-    status, n_iterations, rms, n_kept = _icp(
-        reading[read],
-        reference,
-        normals[ref],
-        build_leaves(reference),
-        T,
-        k,
-        config.trim_ratio,
-        config.error_metric == "point_to_plane",
-        config.max_iterations,
-        config.n_smoothed,
-        config.rotation_epsilon_rad,
-        config.translation_epsilon_m,
-    )
-    T[:3, 3] += mean
-    return Registration(T, n_iterations, status == _CONVERGED, REASONS[status], rms, n_kept)
+    return _register_pair(_pair(reading, reference, normals), T_init, config)
 
 
 def register(
@@ -112,10 +98,19 @@ def register_many(
     """Register from many starts, each with subsamples of its own.
 
     T_inits: (n, 4, 4); seeds: n seeds of numpy's default generator.  Each result depends on its
-    own start and seed only, hence not on the number of threads.
+    own start and seed only, hence not on the number of threads.  Where the clouds are small
+    enough for every subsample to be the whole of both, they are put in order once.
     """
+    whole = None
+    if (
+        len(reading.points) <= config.n_reading_points
+        and 0 < len(reference.points) <= config.n_reference_points
+    ):
+        whole = _pair(reading.points, reference.points, reference.normals)
 
     def one(i: int) -> Registration:
+        if whole is not None:
+            return _register_pair(whole, T_inits[i], config)
         rng = np.random.default_rng(seeds[i])
         return register(reading, reference, T_inits[i], config, rng)
 
@@ -123,6 +118,40 @@ def register_many(
         return [one(i) for i in range(len(T_inits))]
     with ThreadPoolExecutor(n_threads) as pool:
         return list(pool.map(one, range(len(T_inits))))
+
+
+def _pair(reading: Array, reference: Array, normals: Array) -> _Pair:
+    if len(reading) == 0 or len(reference) == 0:
+        none = np.empty((0, 3))
+        return _Pair(none, none, none, build_leaves(np.zeros((1, 3))), np.zeros(3))
+    mean = reference.mean(axis=0)
+    reading, reference = np.ascontiguousarray(reading), reference - mean
+    read, ref = tree_order(reading), tree_order(reference)
+    reference = reference[ref]
+    return _Pair(reading[read], reference, normals[ref], build_leaves(reference), mean)
+
+
+def _register_pair(pair: _Pair, T_init: Array, config: IcpConfig) -> Registration:
+    if len(pair.reading) == 0 or len(pair.reference) < config.n_neighbors:
+        return Registration(T_init.copy(), 0, False, REASONS[_TOO_FEW_POINTS], math.nan, 0)
+    T = T_init.copy()
+    T[:3, 3] -= pair.mean
+    status, n_iterations, rms, n_kept = _icp(
+        pair.reading,
+        pair.reference,
+        pair.normals,
+        pair.leaves,
+        T,
+        config.n_neighbors,
+        config.trim_ratio,
+        config.error_metric == "point_to_plane",
+        config.max_iterations,
+        config.n_smoothed,
+        config.rotation_epsilon_rad,
+        config.translation_epsilon_m,
+    )
+    T[:3, 3] += pair.mean
+    return Registration(T, n_iterations, status == _CONVERGED, REASONS[status], rms, n_kept)
 
 
 @njit(cache=True, nogil=True)

@@ -207,14 +207,16 @@ def search(moved: Array, leaves: Leaves, cap2: float, distances2: Array, indices
     return total
 
 
-@intrinsic  # type: ignore[misc]
-def _lowest_bit(context: Any, mask: Any) -> Any:
-    """Return the place of the lowest bit that is set (one instruction)."""
+def _trailing_zeros(_: Any, __: Any) -> Any:
+    """Compile to the one instruction that finds the lowest bit that is set."""
 
     def codegen(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
 
     return types.int64(types.int64), codegen
+
+
+_lowest_bit: Any = intrinsic(_trailing_zeros)
 
 
 @njit(cache=True, nogil=True, inline="always")
