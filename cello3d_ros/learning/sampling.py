@@ -95,19 +95,28 @@ def sample_prepared(
     progress: Progress = lambda n: None,
 ) -> PairRecord:
     """Sample one pair of prepared scans; a scan without a cloud makes a rejected pair."""
-    T_mean = inverse(reference[1]) @ reading[1]
+    T_mean = _between(reference, reading)
     if isinstance(reference[0], CloudError) or isinstance(reading[0], CloudError):
-        return PairRecord(
-            recording=recording,
-            i=i,
-            j=j,
-            accepted=False,
-            T_mean=T_mean,
-            reason="too_few_points",
-        )
+        return _without_cloud(recording, i, j, T_mean)
     return sample_pair(
         recording, i, j, reading[0], reference[0], T_mean, pipeline, sampling, n_threads, progress
     )
+
+
+def describe_prepared(
+    recording: str,
+    i: int,
+    j: int,
+    reference: Prepared,
+    reading: Prepared,
+    pipeline: Pipeline,
+    sampling: SamplingConfig,
+) -> PairRecord:
+    """Describe one pair of prepared scans as ``describe_pair`` does."""
+    T_mean = _between(reference, reading)
+    if isinstance(reference[0], CloudError) or isinstance(reading[0], CloudError):
+        return _without_cloud(recording, i, j, T_mean)
+    return describe_pair(recording, i, j, reading[0], reference[0], T_mean, pipeline, sampling)
 
 
 def sample_pair(
@@ -277,10 +286,11 @@ def prepare_scan(
     if scan.T_world_sensor is None:
         raise RecordingError(f"{name}: scan {index} has no ground truth, sampling needs it")
     rng = np.random.default_rng([sampling.seed, _name_seed(name), index])
+    T_world_sensor = np.array(scan.T_world_sensor, order="C")
     try:
-        return prepare(scan.points, pipeline.cloud, rng), scan.T_world_sensor
+        return prepare(scan.points, pipeline.cloud, rng), T_world_sensor
     except CloudError as error:
-        return error, scan.T_world_sensor
+        return error, T_world_sensor
 
 
 def check_complete(name: str, n_read: int, needed: set[int]) -> None:
@@ -289,6 +299,16 @@ def check_complete(name: str, n_read: int, needed: set[int]) -> None:
         raise RecordingError(
             f"{name}: ends early, after {n_read} scans: scan {max(needed)} is missing"
         )
+
+
+def _between(reference: Prepared, reading: Prepared) -> Array:
+    return np.ascontiguousarray(inverse(reference[1]) @ reading[1])
+
+
+def _without_cloud(recording: str, i: int, j: int, T_mean: Array) -> PairRecord:
+    return PairRecord(
+        recording=recording, i=i, j=j, accepted=False, T_mean=T_mean, reason="too_few_points"
+    )
 
 
 def _pair_seed(record: PairRecord, sampling: SamplingConfig) -> list[int]:
