@@ -77,11 +77,12 @@ class Job:
 
 
 @contextmanager
-def connected(address: str, timeout_s: float = CONNECT_TIMEOUT_S) -> Iterator[Client]:
+def connected(address: str, timeout_s: float | None = None) -> Iterator[Client]:
     """Give a client of the scheduler at an address such as ``tcp://host:8786``.
 
     Raises ClusterError when it cannot be reached, or is lost on the way.
     """
+    timeout_s = CONNECT_TIMEOUT_S if timeout_s is None else timeout_s
     try:
         dask, core = import_module("dask"), import_module("distributed.core")
         distributed = import_module("distributed")
@@ -91,14 +92,15 @@ def connected(address: str, timeout_s: float = CONNECT_TIMEOUT_S) -> Iterator[Cl
         ) from None
 
     async def knock() -> None:
-        (await core.connect(address, timeout=timeout_s)).abort()
+        comm = await asyncio.wait_for(core.connect(address, timeout=timeout_s), timeout_s + 0.5)
+        comm.abort()
 
     with dask.config.set({"distributed.comm.timeouts.connect": timeout_s}):
         try:
             asyncio.run(knock())  # a client that fails to connect takes half a minute to go
             client = distributed.Client(address, timeout=timeout_s, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:  # TimeoutError is an OSError
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            reason = (str(error).splitlines() or [f"silent for {timeout_s:g} s"])[0]
             raise ClusterError(f"no Dask scheduler answers at {address}: {reason}") from None
         try:
             yield client
@@ -188,6 +190,9 @@ class _UnderWay:
         """Wait for at least one task; report it, and yield the record of a finished pair."""
         last = []
         for future in finished.next_batch(block=True):
+            if future.status in ("lost", "pending"):  # ended, its worker died, is made again
+                finished.add(future)
+                continue
             pair, n, is_last = self._ends.pop(future.key)
             if future.status != "finished":
                 self.error = self.error or self._error(pair, future)

@@ -8,10 +8,10 @@ the same bits: ``describe_pair``, ``register_block`` for each range of its regis
 from __future__ import annotations
 
 import hashlib
-import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -68,9 +68,7 @@ def sample_recording(
     needed = {index for ij in todo for index in ij}
     window: dict[int, Prepared] = {}
     n_read = 0
-    for j, scan in enumerate(recording):
-        if not needed or j > max(needed):
-            return
+    for j, scan in enumerate(islice(recording, max(needed, default=-1) + 1)):
         n_read = j + 1
         window.pop(j - sampling.max_gap - 1, None)
         if j not in needed:
@@ -142,7 +140,7 @@ def sample_pair(
     if record.reason != PENDING:
         return record
     blocks: list[Block] = []
-    for start, stop in itertools.pairwise([0, *stops(sampling)]):
+    for start, stop in pairwise([0, *stops(sampling)]):
         blocks.append(
             register_block(record, reading, reference, pipeline, sampling, start, stop, n_threads)
         )
