@@ -18,10 +18,10 @@ from cello3d_ros.geometry.se3 import exp, inverse, transform
 from cello3d_ros.learning.cluster import (
     ClusterError,
     Job,
-    _Reader,
     connected,
     sample_recording_on,
 )
+from cello3d_ros.learning.cluster_tasks import _Reader
 from cello3d_ros.learning.pairs import pairs
 from cello3d_ros.learning.sampling import sample_recording
 from cello3d_ros.recordings import open_recording
