@@ -78,7 +78,12 @@ def run(arguments: argparse.Namespace) -> None:
         dataset = open_dataset(arguments.out, pipeline, sampling, create=True)
         for recording in recordings:
             dataset.add_recording(recording.name, {"n_scans": len(recording)})
-        outcomes = _sample(recordings, dataset, sampler, bar, arguments.jobs)
+        try:
+            outcomes = _sample(recordings, dataset, sampler, bar, arguments.jobs)
+        except SystemError as error:  # what CPython makes of Ctrl-C in a compiled kernel
+            if isinstance(error.__cause__, KeyboardInterrupt):
+                raise error.__cause__ from None
+            raise
     print(f"{arguments.out}: {_summary(outcomes)}")
 
 
