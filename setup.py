@@ -9,7 +9,9 @@ OPEN3D = [
     "open3d-cpu>=0.19; platform_machine == 'x86_64'",
     "open3d>=0.19; platform_machine != 'x86_64'",
 ]
-TEST = ["pytest"]
+CLUSTER = ["distributed>=2024.1"]
+SMALL_GICP = ["small_gicp>=1.0"]
+TEST = ["pytest", *CLUSTER, *SMALL_GICP]
 
 setup(
     name=NAME,
@@ -38,7 +40,8 @@ setup(
     extras_require={
         "ros": ROS,
         "open3d": OPEN3D,
-        "cluster": ["distributed>=2024.1"],
+        "cluster": CLUSTER,
+        "small_gicp": SMALL_GICP,
         "test": TEST,
         "dev": [*TEST, "ruff", "mypy", "import-linter", "types-PyYAML"],
     },
