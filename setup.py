@@ -11,7 +11,7 @@ OPEN3D = [
 ]
 CLUSTER = ["distributed>=2024.1"]
 SMALL_GICP = ["small_gicp>=1.0"]
-TEST = ["pytest", *CLUSTER, *SMALL_GICP]
+TEST = ["pytest", "scikit-learn>=1.3", *CLUSTER, *SMALL_GICP]
 
 setup(
     name=NAME,
@@ -30,7 +30,6 @@ setup(
         "numpy>=1.26,<2.5",
         "scipy>=1.11",
         "numba>=0.59",
-        "scikit-learn>=1.3",
         "threadpoolctl>=3.1",
         "PyYAML>=6",
         "tqdm>=4.60",
