@@ -9,7 +9,7 @@ import numpy as np
 
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.recordings.odometry import drift_odometry
+from cello3d_ros.recordings.odometry import PoseTrack, drift_odometry
 from cello3d_ros.recordings.paths import walk
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.recordings.scanner import SCANNERS, Scanner, raycasting_scene, scan
@@ -43,6 +43,11 @@ class Simulation:
         """World and seed."""
         return f"{self.world}-{self.seed}"
 
+    @property
+    def n_projected(self) -> int:
+        """0: poses are exact."""
+        return 0
+
     def __len__(self) -> int:
         return self.n_scans
 
@@ -56,6 +61,11 @@ class Simulation:
                 T_world_sensor=truth[k],
                 T_odom_sensor=odometry[k],
             )
+
+    def track(self) -> PoseTrack:
+        """Return the odometry at the stamps."""
+        stamps = [FIRST_STAMP_NS + k * STEP_NS for k in range(self.n_scans)]
+        return PoseTrack.of_poses(stamps, self.build()[2])
 
     def build(self) -> tuple[World, Array, Array]:
         """Return the world, and T_world_sensor and T_odom_sensor, both (n_scans, 4, 4)."""

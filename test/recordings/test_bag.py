@@ -17,6 +17,7 @@ from cello3d_ros.recordings.bag import BagRecording, write_bag
 
 CLOUD, ODOMETRY = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry"
 POSE, TRANSFORM = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped"
+TF = "tf2_msgs/msg/TFMessage"
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND + 123_456_789
 FORMATS = ["bag", "sqlite3", "mcap"]
@@ -168,10 +169,13 @@ def test_a_written_bag_says_what_players_need(tmp_path: Path) -> None:
     with Reader(tmp_path / "one") as reader:
         assert {c.topic: c.msgtype for c in reader.connections} == {
             "/points": CLOUD, "/odom": ODOMETRY, "/ground_truth": ODOMETRY,
+            "/tf": TF, "/tf_static": TF,
         }  # fmt: skip
         for connection in reader.connections:
             (qos,) = connection.ext.offered_qos_profiles
-            assert (qos.reliability.name, qos.durability.name) == ("RELIABLE", "VOLATILE")
+            assert qos.reliability.name == "RELIABLE"
+            late = connection.topic == "/tf_static"  # who comes late must hear it too
+            assert qos.durability.name == ("TRANSIENT_LOCAL" if late else "VOLATILE")
             assert connection.ext.serialization_format == "cdr"
         first = {}
         for connection, _, raw in reader.messages():
