@@ -9,7 +9,7 @@ OPEN3D = [
     "open3d-cpu>=0.19; platform_machine == 'x86_64'",
     "open3d>=0.19; platform_machine != 'x86_64'",
 ]
-TEST = ["pytest"]
+TEST = ["pytest", "mcap>=1.1", "mcap-ros2-support>=0.5"]
 
 setup(
     name=NAME,
@@ -33,6 +33,7 @@ setup(
         "tqdm>=4.60",
         "matplotlib>=3.6",
         "rosbags>=0.11,<0.12",
+        "pyarrow>=15",
     ],
     extras_require={
         "ros": ROS,
