@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from cello3d_ros.errors import RecordingError
 
 if TYPE_CHECKING:
-    from cello3d_ros.recordings import Recording, Scan
+    from cello3d_ros.recordings import Recording
 
 
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +58,7 @@ def open_source(path: Path, arguments: argparse.Namespace) -> Recording:
     )
 
 
-def with_progress(scans: Iterable[Scan], total: int, name: str) -> Any:
+def with_progress(scans: Iterable[Any], total: int, name: str) -> Any:
     """Return the scans, with a bar of counts and time left where there is a terminal."""
     from tqdm import tqdm
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.recordings.recording import Recording, Scan
 
 
 def drift_odometry(
@@ -40,6 +42,28 @@ def drift_odometry(
     for step in noisy:
         out.append(out[-1] @ step)
     return np.stack(out)
+
+
+def with_odometry(recording: Recording, seed: int = 0) -> Iterator[Scan]:
+    """Yield the scans; where a recording has no odometry, its ground truth made to drift.
+
+    Raises RecordingError where there is neither.
+    """
+    first = next(iter(recording), None)
+    if first is None:
+        raise RecordingError(f"{recording.name} holds no scan")
+    if first.T_odom_sensor is not None:
+        for scan in recording:
+            if scan.T_odom_sensor is not None:
+                yield scan
+        return
+    truth = [scan.T_world_sensor for scan in recording]
+    known = [T for T in truth if T is not None]
+    if len(known) < len(truth):
+        raise RecordingError(f"{recording.name} has neither odometry nor ground truth throughout")
+    drifted = drift_odometry(np.stack(known), np.random.default_rng(seed))
+    for scan, T in zip(recording, drifted, strict=True):
+        yield replace(scan, T_odom_sensor=T)
 
 
 class PoseTrack:
