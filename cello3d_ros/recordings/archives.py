@@ -52,6 +52,8 @@ class Files:
         with _one_sentence(archive):
             with zipfile.ZipFile(archive) as opened:
                 members = [m for m in opened.infolist() if not m.is_dir()]
+                for member in members:
+                    opened.open(member).close()  # its name must be the same in both places
             for member in members:
                 _check_member(archive, member)
                 name = prefix + member.filename

@@ -162,6 +162,8 @@ class BagRecording:
                         poses.tree.add(message, static=topic.endswith(TF_STATIC))
             for t in wanted:
                 with _one_sentence(self.path, f"{t}: "):
+                    if (n := len(poses.logs[t])) < self.counts[t]:
+                        raise RecordingError(f"ends early, after {n} of {self.counts[t]} poses")
                     poses.tracks[t] = poses.logs[t].track()
             self._poses = poses
         return self._poses

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,19 @@ from cello3d_ros.recordings.point_times import INTENSITIES, NAMES, TimeLaw, reco
 from cello3d_ros.recordings.recording import Scan
 
 Columns = dict[str, NDArray[Any]]
+
+
+_DAMAGE = (  # what numpy's reader of headers lets through, and allocations of damaged sizes
+    ValueError,
+    TypeError,
+    KeyError,
+    EOFError,
+    OverflowError,
+    MemoryError,
+    SyntaxError,
+    RecursionError,
+    TokenError,
+)
 
 
 def read_cloud(path: Path | str) -> Array:
@@ -40,7 +54,7 @@ def read_columns(path: Path | str) -> Columns:
         raise RecordingError(f"{path}: no such file")
     try:
         return reader(tables.read_bytes(path), path)
-    except (ValueError, EOFError, OverflowError, MemoryError, SyntaxError) as error:
+    except _DAMAGE as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise RecordingError(f"{path}: cannot be read ({reason})") from error
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cello3d_ros.errors import RecordingError
 
+_MAX_RATIO = 264 / 3  # LZF copies at most 264 bytes with 3
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
@@ -83,7 +84,7 @@ def _compressed(
 ) -> Found:
     size = n * sum(d.itemsize * c for d, c in zip(dtypes, counts))
     packed, unpacked = (int(v) for v in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
-    if unpacked != size or len(body) < 8 + packed:
+    if unpacked != size or len(body) < 8 + packed or size > _MAX_RATIO * max(packed, 1):
         raise RecordingError(f"{where}: declares {size} bytes, but its blocks are of other sizes")
     out = np.zeros(size, np.uint8)
     if _lzf(np.frombuffer(body, np.uint8, packed, 8), out) != size:

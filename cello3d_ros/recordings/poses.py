@@ -15,6 +15,7 @@ from cello3d_ros.recordings import tables
 
 _EXACT = 1e-12  # a rotation this close to orthonormal is left as it is,
 _ROUNDED = 1e-6  # one this close is rounded, as text is: made exact but not counted
+_UNIT = 1e-3  # quaternions farther from unit length are damaged
 
 
 class Poses(NamedTuple):
@@ -52,8 +53,11 @@ class StampedRows(NamedTuple):
 
 
 def read_tum(data: bytes, where: object) -> StampedRows:
-    """Return the rows of a TUM trajectory, as evo and others write it."""
+    """Return the rows of a TUM trajectory, as evo and others write it.  Raises RecordingError."""
     rows = tables.numbers(data, 8, where)
+    bad = ~(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0) <= _UNIT)
+    if bad.any():
+        raise RecordingError(f"{where}: row {int(np.argmax(bad)) + 1} has no unit quaternion")
     return StampedRows(stamps_of(data, where), rows[:, 1:])
 
 

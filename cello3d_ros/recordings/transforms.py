@@ -19,6 +19,9 @@ class PoseLog:
     def __init__(self) -> None:
         self._stamps, self._rows = array("q"), array("d")
 
+    def __len__(self) -> int:
+        return len(self._stamps)
+
     def add(self, stamp_ns: int, position: Any, rotation: Any) -> None:
         """Keep one pose of a message."""
         self._stamps.append(stamp_ns)
