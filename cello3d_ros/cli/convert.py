@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cello3d_ros.cli.sources import add_source_arguments, open_source, with_progress
 from cello3d_ros.errors import RecordingError
@@ -47,12 +47,15 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.out.exists():
         raise RecordingError(f"{arguments.out} exists already; give another name or remove it")
     recording = open_source(arguments.source, arguments)
-    n_written = _write(arguments, recording, _scans(arguments, recording))
+    counts = {"n_with_ground_truth": 0, "n_with_odometry": 0}
+    scans = _counted(_scans(arguments, recording), counts)
+    n_written = _write(arguments, recording, scans)
     summary = {
         "out": str(arguments.out),
         "format": arguments.format,
         "n_scans": n_written,
         "n_left_out": len(recording) - n_written,
+        **counts,
         "n_poses_projected": recording.n_projected,
     }
     print(json.dumps(summary) if arguments.json else _sentence(summary))
@@ -64,6 +67,13 @@ def _scans(arguments: argparse.Namespace, recording: Recording) -> Iterable[Scan
     scans = deskewed(recording) if arguments.deskew else recording
     progress: Iterable[Scan] = with_progress(scans, len(recording), recording.name)
     return progress
+
+
+def _counted(scans: Iterable[Scan], counts: dict[str, int]) -> Iterator[Scan]:
+    for scan in scans:
+        counts["n_with_ground_truth"] += scan.T_world_sensor is not None
+        counts["n_with_odometry"] += scan.T_odom_sensor is not None
+        yield scan
 
 
 def _write(arguments: argparse.Namespace, recording: Recording, scans: Iterable[Scan]) -> int:
@@ -82,10 +92,13 @@ def _write(arguments: argparse.Namespace, recording: Recording, scans: Iterable[
     return write_bag(out, scans, provenance=made_by, storage=kind, double=arguments.double)
 
 
-def _sentence(summary: dict[str, object]) -> str:
+def _sentence(summary: dict[str, Any]) -> str:
     text = f"{summary['out']}: {summary['n_scans']} scans"
     if summary["n_left_out"]:
         text += f"; {summary['n_left_out']} left out, their poses do not cover them"
+    for what in ("ground_truth", "odometry"):
+        if 0 < (n := summary[f"n_with_{what}"]) < summary["n_scans"]:
+            text += f"; only {n} have {what.replace('_', ' ')}"
     if summary["n_poses_projected"]:
         text += f"; {summary['n_poses_projected']} poses were not quite rigid and were made so"
     return text

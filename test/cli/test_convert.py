@@ -203,6 +203,16 @@ def test_a_full_disk_leaves_nothing(tmp_path: Path, kind: str, room: int) -> Non
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
+def test_scans_beyond_the_poses_are_counted(tmp_path: Path, capsys) -> None:
+    write_bag(tmp_path / "a", make_scans(4))
+    assert main(["convert", str(tmp_path / "a"), str(tmp_path / "b"), "--format", "npy"]) == 0
+    poses = tmp_path / "b" / "ground_truth.tum"
+    poses.write_text("".join(poses.read_text().splitlines(keepends=True)[:3]))
+    capsys.readouterr()
+    assert main(["convert", str(tmp_path / "b"), str(tmp_path / "c")]) == 0
+    assert "4 scans; only 3 have ground truth" in capsys.readouterr().out
+
+
 def test_json_says_what_was_done(tmp_path: Path, capsys) -> None:
     write_bag(tmp_path / "a", make_scans(3))
     assert main(["convert", str(tmp_path / "a"), str(tmp_path / "b"), "--json"]) == 0

@@ -368,13 +368,22 @@ def test_broken_metadata_is_an_error(tmp_path: Path) -> None:
 
 
 def test_a_bag_with_fewer_clouds_than_it_declares_is_an_error(tmp_path: Path) -> None:
-    write_bag(tmp_path / "one", make_scans(3))
+    bare = [Scan(stamp_ns=s.stamp_ns, points=s.points) for s in make_scans(3)]
+    write_bag(tmp_path / "one", bare)
     metadata = tmp_path / "one" / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace("message_count: 3\n", "message_count: 4\n"))
     scans = iter(open_recording(tmp_path / "one"))
     assert [next(scans).stamp_ns for _ in range(3)]
     with pytest.raises(RecordingError, match="one: ends early, after 3 of 4 clouds"):
         next(scans)
+
+
+def test_a_bag_with_fewer_poses_than_it_declares_is_an_error(tmp_path: Path) -> None:
+    write_bag(tmp_path / "one", make_scans(3))
+    metadata = tmp_path / "one" / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("message_count: 21\n", "message_count: 22\n"))
+    with pytest.raises(RecordingError, match="one: /odom: ends early, after 21 of 22 poses"):
+        list(open_recording(tmp_path / "one"))
 
 
 def test_an_existing_target_is_refused_and_left_alone(tmp_path: Path) -> None:
