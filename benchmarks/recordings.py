@@ -10,16 +10,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
 
 import numpy as np
 
@@ -71,7 +67,7 @@ def read_asl(folder: Path) -> dict[str, float]:
     rows = rng.normal(scale=8.0, size=(n, 3))
     lines = ["Time_in_sec,x,y,z,Intensities,2DscanId,PointId"]
     lines += [
-        f"{1314117928.25 + 1e-5 * k:.8f},{x:.8f},{y:.8f},{z:.8f},-1.00000000,{k // 1077},{k % 1077}"
+        f"{1314117928.25 + 1e-5 * k:.8f},{x:.8f},{y:.8f},{z:.8f},-1.00000000,{k // 1077},{k}"
         for k, (x, y, z) in enumerate(rows)
     ]
     path = folder / "Hokuyo_0.csv"

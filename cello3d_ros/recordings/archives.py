@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.recordings.tables import read_bytes
 
+_DEPTHS = ("*", "*/*", "*/*/*")  # how far down a folder is looked
 _MAX_BYTES = 4 << 30  # a member that declares more is not a scan
 
 
@@ -28,7 +29,7 @@ class Files:
         if path.is_file():
             self._add_zip(path, "")
             return
-        for file in sorted(p for p in path.rglob("*") if p.is_file()):
+        for file in sorted(p for pattern in _DEPTHS for p in path.glob(pattern) if p.is_file()):
             name = file.relative_to(path)
             if file.suffix.lower() == ".zip":
                 self._add_zip(file, "" if name.parent == Path(".") else f"{name.parent}/")

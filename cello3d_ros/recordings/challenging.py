@@ -44,8 +44,8 @@ _MATRIX = [f"t{i}{j}" for i in range(4) for j in range(4)]
 
 def sequence_of(name: str) -> str | None:
     """Return which of the eight sequences a folder or archive is called after, or None."""
-    words = re.sub(r"[^a-z]+", "_", name.lower())
-    return next((full for key, full in SEQUENCES.items() if key in words), None)
+    words = "_" + re.sub(r"[^a-z]+", "_", name.lower()) + "_"
+    return next((full for key, full in SEQUENCES.items() if f"_{key}_" in words), None)
 
 
 class _PoseFile(NamedTuple):

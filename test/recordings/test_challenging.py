@@ -131,6 +131,7 @@ def test_all_eight_sequences_are_known_by_name() -> None:
     assert {name: sequence_of(name) for name in names} == names
     assert len(set(SEQUENCES.values())) == 8
     assert sequence_of("my_room") is None
+    assert sequence_of("method") is None  # a word, not letters within one
 
 
 def test_poses_may_be_numbered_from_one(tmp_path: Path) -> None:

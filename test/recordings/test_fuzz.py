@@ -175,9 +175,10 @@ def fate(path: Path, before: list[tuple]) -> str:
     try:
         return "same" if contents(path) == before else "changed"
     except RecordingError as error:
-        assert "\n" not in str(error)
-        assert str(path) in str(error)
-        return "error"
+        sentence = str(error)
+    assert "\n" not in sentence
+    assert str(path) in sentence
+    return "error"
 
 
 @pytest.mark.parametrize("kind", KINDS)
