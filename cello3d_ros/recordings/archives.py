@@ -13,7 +13,7 @@ from cello3d_ros.errors import RecordingError
 from cello3d_ros.recordings.tables import read_bytes
 
 _DEPTHS = ("*", "*/*", "*/*/*")  # how far down a folder is looked
-_MAX_BYTES = 4 << 30  # a member that declares more is not a scan
+_MAX_BYTES = 1 << 30  # a member that declares more is not a scan
 
 
 class Files:

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from cello3d_ros.errors import RecordingError
@@ -41,6 +43,20 @@ SCANS = [
 
 def mcap(folder: Path) -> tuple[Path, Path]:
     write_bag(folder / "a", SCANS)
+    return folder / "a", folder / "a" / "a.mcap"
+
+
+def foreign_mcap(folder: Path) -> tuple[Path, Path]:
+    """As most recorders write it: compressed, without checksums."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    kind = "sensor_msgs/msg/PointCloud2"
+    writer = Writer2(folder / "a", version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer as bag:
+        connection = bag.add_connection("/points", kind, typestore=store)
+        for scan in SCANS:
+            message = Messages(store).cloud(scan)
+            bag.write(connection, scan.stamp_ns, store.serialize_cdr(message, kind))
     return folder / "a", folder / "a" / "a.mcap"
 
 
@@ -134,6 +150,7 @@ def ascii_ply(folder: Path) -> tuple[Path, Path]:
 
 KINDS: dict[str, Callable[[Path], tuple[Path, Path]]] = {
     "mcap": mcap,
+    "mcap zstd, no checksums": foreign_mcap,
     "metadata.yaml": metadata,
     "sqlite3": db3,
     "rosbag1": rosbag1,
@@ -153,7 +170,7 @@ KINDS: dict[str, Callable[[Path], tuple[Path, Path]]] = {
     "ASL poses": asl("pose_scanner_leica.csv"),
     "zip": archive,
 }
-CHECKSUMMED = ("zip",)
+CHECKSUMMED = ("mcap", "zip")
 
 
 def contents(path: Path) -> list[tuple]:

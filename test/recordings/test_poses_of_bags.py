@@ -177,7 +177,10 @@ def test_a_split_bag_is_read_in_order(tmp_path: Path, plugin) -> None:
     assert all(np.allclose(s.T_odom_sensor, ODOM[k]) for k, s in enumerate(scans))
 
 
-def test_a_split_rosbag1_is_read_in_order(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "packed", [None, Writer1.CompressionFormat.BZ2, Writer1.CompressionFormat.LZ4]
+)
+def test_a_split_rosbag1_is_read_in_order(tmp_path: Path, packed) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
     make = Messages(store)
     header = store.types["std_msgs/msg/Header"]
@@ -185,7 +188,10 @@ def test_a_split_rosbag1_is_read_in_order(tmp_path: Path) -> None:
         seq=0, stamp=store.types["builtin_interfaces/msg/Time"](*divmod(ns, 10**9)), frame_id=frame
     )
     for part, lot in enumerate(([0, 1, 2], [3, 4])):
-        with Writer1(tmp_path / f"walk_{part}.bag") as bag:
+        writer = Writer1(tmp_path / f"walk_{part}.bag")
+        if packed is not None:
+            writer.set_compression(packed)
+        with writer as bag:
             kind = "sensor_msgs/msg/PointCloud2"
             connection = bag.add_connection("/points", kind, typestore=store)
             for k in lot:
