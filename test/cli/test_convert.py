@@ -203,6 +203,17 @@ def test_a_full_disk_leaves_nothing(tmp_path: Path, kind: str, room: int) -> Non
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
+def test_open3d_reads_the_ply_files(tmp_path: Path) -> None:
+    o3d = pytest.importorskip("open3d")
+    scans = make_scans()
+    write_bag(tmp_path / "a", scans)
+    assert main(["convert", str(tmp_path / "a"), str(tmp_path / "b"), "--format", "ply"]) == 0
+    for k, scan in enumerate(scans):
+        cloud = o3d.t.io.read_point_cloud(str(tmp_path / "b" / f"{k:06d}.ply"))
+        assert np.array_equal(cloud.point.positions.numpy(), scan.points)
+        assert np.array_equal(cloud.point["time"].numpy().ravel(), scan.time_s)
+
+
 def test_scans_beyond_the_poses_are_counted(tmp_path: Path, capsys) -> None:
     write_bag(tmp_path / "a", make_scans(4))
     assert main(["convert", str(tmp_path / "a"), str(tmp_path / "b"), "--format", "npy"]) == 0

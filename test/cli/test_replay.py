@@ -118,6 +118,20 @@ def test_without_odometry_ground_truth_is_made_to_drift(tmp_path: Path, model: P
     assert len(answers(out / "bag")[TOPICS[0]]) == N - 1
 
 
+def test_the_sensor_is_where_the_node_s_parameter_says(tmp_path: Path, model: Path) -> None:
+    bag = walk(tmp_path / "walk")
+    quarter = [0.1, 0.2, 0.3, 0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5))]
+    (tmp_path / "c.yaml").write_text(f"node: {{T_base_sensor: {quarter}}}\n")
+    words = ["replay", str(bag), "--model", str(model)]
+    assert main([*words, "--out", str(tmp_path / "b"), "--config", str(tmp_path / "c.yaml")]) == 0
+    lines = (tmp_path / "b" / "covariances.jsonl").read_text().splitlines()
+    first = next(answer for line in lines if "T_odom_read" in (answer := json.loads(line)))
+    T = np.reshape(first["T_odom_read"], (4, 4)) @ inverse(np.reshape(first["T_ref_read"], (4, 4)))
+    start = np.reshape([0, -1, 0, 0.1, 1, 0, 0, 0.2, 0, 0, 1, 0.3, 0, 0, 0, 1], (4, 4))
+    assert first["reference_ns"] == 10**18  # where the odometry is the identity
+    assert np.allclose(T, start, atol=1e-9)
+
+
 def test_no_answer_at_all_is_an_error_and_leaves_nothing(tmp_path, model, capsys) -> None:
     bag = walk(tmp_path / "walk", holes=tuple(range(N)))
     assert main(["replay", str(bag), "--out", str(tmp_path / "r"), "--model", str(model)]) == 1

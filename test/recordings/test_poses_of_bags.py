@@ -124,6 +124,15 @@ def test_tf_is_composed_over_time_and_interpolated(tmp_path: Path) -> None:
     assert np.allclose(scan.T_world_sensor, parts[0] @ parts[1] @ MOUNT, atol=1e-12)
 
 
+def test_tf_is_walked_upward_too(tmp_path: Path) -> None:
+    """As localisation publishes it that must keep odom the child: base_link -> world."""
+    path = write(
+        tmp_path / "b", [*mount(), *tf("base_link", "world", se3.inverse(TRUTH)), *clouds()]
+    )
+    for k, scan in enumerate(open_recording(path, ground_truth_frames=("world", "lidar"))):
+        assert np.allclose(scan.T_world_sensor, TRUTH[k] @ MOUNT, atol=1e-12)
+
+
 def test_outside_the_span_of_tf_there_is_no_ground_truth(tmp_path: Path) -> None:
     path = write(tmp_path / "b", [*mount(), *list(tf())[:3], *clouds()])
     found = [s.T_world_sensor for s in open_recording(path, ground_truth_frames=("map", "lidar"))]
