@@ -11,7 +11,14 @@ OPEN3D = [
 ]
 CLUSTER = ["distributed>=2024.1"]
 SMALL_GICP = ["small_gicp>=1.0"]
-TEST = ["pytest", "scikit-learn>=1.3", *CLUSTER, *SMALL_GICP]
+TEST = [
+    "pytest",
+    "scikit-learn>=1.3",
+    "mcap>=1.1",
+    "mcap-ros2-support>=0.5",
+    *CLUSTER,
+    *SMALL_GICP,
+]
 
 setup(
     name=NAME,
@@ -35,6 +42,7 @@ setup(
         "tqdm>=4.60",
         "matplotlib>=3.6",
         "rosbags>=0.11,<0.12",
+        "pyarrow>=15",
     ],
     extras_require={
         "ros": ROS,
