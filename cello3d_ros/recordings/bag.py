@@ -211,8 +211,11 @@ def _scan(message: Any, stamp_ns: int, law: TimeLaw | None) -> tuple[Scan, TimeL
 
 
 def _parts(path: Path) -> list[Path]:
-    """Return what to open: the path, or the parts of a bag that was split without metadata."""
-    if path.is_dir() and not (path / "metadata.yaml").exists():
+    """Return what to open: the path, or the files of a folder that rosbags would not know.
+
+    Such are bags that were split without metadata, and a rosbag2 named like a rosbag1, ``.bag``.
+    """
+    if path.is_dir() and (path.suffix == ".bag" or not (path / "metadata.yaml").exists()):
         for ending in _ENDINGS:
             if parts := sorted(path.glob(f"*{ending}")):
                 return parts

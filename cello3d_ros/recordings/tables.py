@@ -78,9 +78,11 @@ def read_bytes(path: Path) -> bytes:
 
 
 def _parsed(rows: bytes, names: list[str], separator: str, where: object) -> dict[str, Array]:
-    import pyarrow
-    from pyarrow import csv
-
+    try:
+        import pyarrow
+        from pyarrow import csv
+    except ImportError:
+        raise RecordingError(f"{where}: reading CSV needs PyArrow: pip install pyarrow") from None
     try:
         table: Any = csv.read_csv(
             pyarrow.py_buffer(rows),

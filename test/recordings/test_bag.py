@@ -141,6 +141,13 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
                 same(scan, other)
 
 
+def test_a_folder_named_like_a_rosbag1_is_read(tmp_path: Path) -> None:
+    scans = make_scans()
+    write_bag(tmp_path / "drive.bag", scans)
+    for scan, other in zip(scans, open_recording(tmp_path / "drive.bag"), strict=True):
+        same(scan, other)
+
+
 def test_scans_without_poses_are_read_back_without(tmp_path: Path) -> None:
     bare = [Scan(stamp_ns=s.stamp_ns, points=s.points) for s in make_scans(3)]
     write_bag(tmp_path / "bare", bare)
