@@ -144,7 +144,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
 def test_a_folder_named_like_a_rosbag1_is_read(tmp_path: Path) -> None:
     scans = make_scans()
     write_bag(tmp_path / "drive.bag", scans)
-    for scan, other in zip(scans, open_recording(tmp_path / "drive.bag"), strict=True):
+    for scan, other in zip(open_recording(tmp_path / "drive.bag"), scans, strict=True):
         same(scan, other)
 
 
