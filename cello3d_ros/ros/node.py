@@ -75,6 +75,7 @@ class CovarianceNode(Node):
         self._tracker = Tracker(model, self.config, config)
         self._statistics = Statistics(path.name, config.max_failures)
         self._warned_s: dict[str, float] = {}
+        self.get_logger().info("warming up; a first start compiles the kernels")
         warm_up(model, self.config)
         self._connect()
         self.get_logger().info(
