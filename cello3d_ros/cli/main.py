@@ -17,6 +17,7 @@ VERBS = {
     "simulate": "scan a simulated world into a rosbag2",
     "sample": "sample ICP on every pair of recordings into a dataset",
     "train": "learn a model from datasets",
+    "evaluate": "judge covariances beside every baseline",
     "demo": "replay a bag through the node and judge its answers",
 }
 
