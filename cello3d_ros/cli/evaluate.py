@@ -40,6 +40,7 @@ _TRAJECTORY = (
     ("length m", "length_m", "10.1f"),
     ("runs", "n_runs", "10d"),
     ("failed", "n_failed", "10d"),
+    ("lost", "n_lost", "10d"),
     ("D_M", "dm_6dof", "10.2f"),
     ("transl.", "dm_translation", "10.2f"),
     ("rotation", "dm_rotation", "10.2f"),
@@ -332,7 +333,12 @@ def _tables(report: dict[str, Any]) -> Iterator[str]:
         part = report["with_flagged_pairs"]
         yield from _table(f"flagged too ({part['n_pairs']} pairs)", _COLUMNS, part["methods"])
     if report["trajectories"]:
-        yield from _table("trajectories", _TRAJECTORY, report["trajectories"])
+        rows = {}
+        for name, row in report["trajectories"].items():
+            rows[name] = row
+            if row["n_lost"]:
+                rows[f"{name}, not the lost"] = row["without_lost"]
+        yield from _table("trajectories", _TRAJECTORY, rows)
 
 
 def _table(
