@@ -79,6 +79,8 @@ def from_dataset(
     """
     if found := differences(examples.pipeline, model.pipeline):
         raise DatasetError(f"the dataset does not go with the model: {found[0]}")
+    if model.shape != "none" and model.shape not in examples.shapes:
+        raise DatasetError(f"the dataset does not hold the {model.shape} of each pair")
     n = len(examples.covariances)
     row = unturned_rows(examples).start
     S: Sequence[Array | None] = [None] * n

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from cello3d_ros.cli.main import main
+from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import SamplingConfig
 from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.geometry.se3 import Array, exp, inverse, transform
 from cello3d_ros.learning.dataset import PairRecord, open_dataset
+from cello3d_ros.registration.icp import Registration
 
 METHODS = {
     "mean_covariance",
@@ -160,6 +162,22 @@ def test_methods_on_clouds_and_trajectories(folder: Path, walk: Path) -> None:
     assert row["n_runs"] == 3
     assert {"dm_6dof", "dm_translation", "dm_rotation"} <= set(row)
     assert row["error_m"] < 0.05
+
+
+def test_the_registration_that_is_judged_starts_from_the_truth(
+    folder: Path, walk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts = []
+
+    def remember(reading: Cloud, reference: Cloud, T_init: Array, *rest: object) -> Registration:
+        starts.append(T_init)
+        return Registration(T_init, 1, True, "", 0.0, 1)
+
+    monkeypatch.setattr("cello3d_ros.learning.online.register", remember)
+    words = ("--only", "walk", "--recordings", walk, "--online-pairs", 1)
+    assert evaluate(folder, *words) == 0
+    T_0, T_1 = np.eye(4), exp([0.3, 0.1, 0, 0, 0, 0.1])
+    np.testing.assert_allclose(starts[-1], inverse(T_0) @ T_1, atol=1e-6)
 
 
 def test_some_pairs_are_enough_for_methods_on_clouds(folder: Path, walk: Path) -> None:

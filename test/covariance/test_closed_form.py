@@ -5,6 +5,7 @@ from cello3d_ros.clouds.neighbors import build_tree, nearest
 from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import CloudConfig, IcpConfig
 from cello3d_ros.covariance.closed_form import (
+    _implicit_derivative,
     _normal_matrices,
     censi,
     closed_form,
@@ -225,6 +226,29 @@ def test_censi_is_the_derivative_of_the_minimum_by_every_coordinate():
     np.testing.assert_allclose(
         found / np.outer(scale, scale), 2.0 * expected / np.outer(scale, scale), atol=1e-6
     )  # 18 of 36 points are drawn: twice the covariance
+
+
+def test_the_second_derivative_holds_away_from_the_minimum_too():
+    P, Q, normals, indices, distances2, T = corners()
+    T = T @ exp([0.1, -0.2, 0.15, 0.05, -0.03, 0.02])
+    near = distances2 == 0.0
+    i, q = np.nonzero(near)[0], indices[near]
+
+    def J(xi):
+        moved = transform(T @ exp(xi), P)[i] - Q[q]
+        return 0.5 * np.sum(np.einsum("ij,ij->i", moved, normals[q]) ** 2)
+
+    step, E = 1e-3, np.eye(6)
+    expected = [
+        [
+            sum(s * t * J(step * (s * a + t * b)) for s in (1, -1) for t in (1, -1))
+            / (4 * step**2)
+            for a in E
+        ]
+        for b in E
+    ]
+    found, _ = _implicit_derivative(cloud(P, normals), cloud(Q, normals), T, indices, near)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-3)
 
 
 def test_censi_grows_with_the_noise_and_refuses_free_directions(pair):

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from cello3d_ros.clouds.neighbors import nearest
 from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import CloudConfig, Pipeline
 from cello3d_ros.covariance import sigma_points as module
+from cello3d_ros.covariance.closed_form import closed_form, common_bias
 from cello3d_ros.covariance.sigma_points import offsets, sensor_term, sigma_points
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import is_positive_definite
@@ -44,6 +46,17 @@ def test_the_points_have_the_mean_and_covariance_of_the_prior():
     assert xi.shape == (12, 6)
     np.testing.assert_allclose(xi.mean(axis=0), 0.0, atol=1e-15)
     np.testing.assert_allclose(xi.T @ xi / 12, prior, atol=1e-15)
+
+
+def test_the_sensor_term_is_that_of_two_clouds_and_a_common_bias(pair):
+    reading, reference = pair
+    icp = Pipeline().icp
+    found = nearest(reference.tree, transform(T_HAT, reading.points), icp.n_neighbors)
+    b = common_bias(reading, reference, T_HAT, *found, icp)
+    H_inverse = closed_form(reading, reference, T_HAT, *found, icp).hessian
+    expected = 0.03**2 * (2 * H_inverse + 2 * np.outer(b, b))
+    np.testing.assert_allclose(sensor_term(*pair, T_HAT, Pipeline(), 0.03), expected, rtol=1e-9)
+    assert np.abs(np.outer(b, b)).max() > H_inverse.max()
 
 
 def test_an_icp_that_stays_put_gives_the_prior_and_the_sensor_term(pair, monkeypatch):

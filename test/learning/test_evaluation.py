@@ -1,5 +1,7 @@
 """Figures with known answers, the pose check, and all methods side by side."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -217,6 +219,17 @@ def test_other_settings_than_the_models_are_refused():
     model = constant_model(np.eye(6), 3, shape="sandwich", pipeline=pipeline)
     with pytest.raises(DatasetError, match=r"cloud.voxel_m is 0.2, not 0.5"):
         from_dataset(model, some(), np.eye(6), MethodSettings())
+
+
+def test_a_dataset_without_the_models_shape_is_refused():
+    targets = dataclasses.replace(some(), shapes={})
+    model = constant_model(np.eye(6), 3, shape="sandwich")
+    with pytest.raises(DatasetError, match="does not hold the sandwich"):
+        from_dataset(model, targets, np.eye(6), MethodSettings())
+    settings = MethodSettings()
+    absolute = from_dataset(constant_model(np.eye(6), 3), targets, np.eye(6), settings)
+    methods = compare(absolute, targets, np.ones(8, np.bool_), settings)["methods"]
+    assert set(methods) == {"mean_covariance", "model", "constant_relative"}
 
 
 def test_the_baseline_is_the_mean_of_the_training_recordings(tmp_path):
