@@ -9,7 +9,16 @@ OPEN3D = [
     "open3d-cpu>=0.19; platform_machine == 'x86_64'",
     "open3d>=0.19; platform_machine != 'x86_64'",
 ]
-TEST = ["pytest"]
+CLUSTER = ["distributed>=2024.1"]
+SMALL_GICP = ["small_gicp>=1.0"]
+TEST = [
+    "pytest",
+    "scikit-learn>=1.3",
+    "mcap>=1.1",
+    "mcap-ros2-support>=0.5",
+    *CLUSTER,
+    *SMALL_GICP,
+]
 
 setup(
     name=NAME,
@@ -28,17 +37,18 @@ setup(
         "numpy>=1.26,<2.5",
         "scipy>=1.11",
         "numba>=0.59",
-        "scikit-learn>=1.3",
         "threadpoolctl>=3.1",
         "PyYAML>=6",
         "tqdm>=4.60",
         "matplotlib>=3.6",
         "rosbags>=0.11,<0.12",
+        "pyarrow>=15",
     ],
     extras_require={
         "ros": ROS,
         "open3d": OPEN3D,
-        "cluster": ["distributed>=2024.1"],
+        "cluster": CLUSTER,
+        "small_gicp": SMALL_GICP,
         "test": TEST,
         "dev": [*TEST, "ruff", "mypy", "import-linter", "types-PyYAML"],
     },

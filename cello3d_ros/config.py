@@ -54,6 +54,14 @@ class CloudConfig(Section):
 class IcpConfig(Section):
     """ICP pipeline (Table I of the paper)."""
 
+    backend: str = _setting(
+        "icp",
+        "what registers; icp is this package's own and follows all settings below",
+        choices=("icp", "open3d_point_to_plane", "open3d_gicp", "small_gicp"),
+    )
+    max_distance_m: float = _setting(
+        2.0, "largest distance of associated points, for other backends than icp", 1e-3
+    )
     error_metric: str = _setting(
         "point_to_plane", "what ICP minimises", choices=("point_to_plane", "point_to_point")
     )
@@ -105,6 +113,13 @@ class SamplingConfig(Section):
     n_rotations: int = _setting(4, "turns about z of each example, 1 is none", 1, 64)
     cluster_min_share: float = _setting(
         0.002, "share of the samples within one radius that makes a core point", 0.0, 1.0
+    )
+    precision: float = _setting(
+        0.0, "relative standard error of the eigenvalues that ends a pair; 0 takes all", 0.0, 1.0
+    )
+    min_samples: int = _setting(200, "fewest registrations before precision ends a pair", 2)
+    noise_m: float = _setting(
+        0.0, "standard deviation of range noise added at each registration", 0.0, 10.0
     )
 
 

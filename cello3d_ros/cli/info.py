@@ -1,4 +1,4 @@
-"""``cello3d info FILE``: what a file is, for a person or, with --json, for a machine."""
+"""``cello3d info SOURCE``: what a model or a recording holds, for people or machines."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cello3d_ros.cli.recording_info import describe_recording, is_recording
+from cello3d_ros.cli.sources import add_source_arguments
 from cello3d_ros.config import PIPELINE, config_to
 from cello3d_ros.covariance.model import FORMAT_VERSION, Model, load_model
 from cello3d_ros.errors import Cello3dError
@@ -20,31 +22,32 @@ class Kind(NamedTuple):
 
     name: str
     matches: Callable[[Path], bool]
-    describe: Callable[[Path], dict[str, Any]]
+    describe: Callable[[Path, argparse.Namespace], dict[str, Any]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
-    parser.add_argument("path", metavar="MODEL", type=Path, help="model file (.npz)")
+    parser.add_argument("path", metavar="SOURCE", type=Path, help="model file or recording")
+    add_source_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Print the description of a file.  Raises Cello3dError if it is of no known kind."""
-    description = describe(arguments.path)
+    description = describe(arguments.path, arguments)
     if arguments.json:
         print(json.dumps(description, indent=2))
     else:
         print("\n".join(table(description)))
 
 
-def describe(path: Path) -> dict[str, Any]:
+def describe(path: Path, arguments: argparse.Namespace) -> dict[str, Any]:
     """Return what is known of a file, in the form that JSON prints; ``kind`` says what it is."""
     if not path.exists():
-        raise Cello3dError(f"{path}: no such file")
+        raise Cello3dError(f"{path}: no such file or folder")
     for kind in KINDS:
         if kind.matches(path):
-            return {"kind": kind.name, "path": str(path), **kind.describe(path)}
+            return {"kind": kind.name, "path": str(path), **kind.describe(path, arguments)}
     names = " or ".join(kind.name for kind in KINDS)
     raise Cello3dError(f"{path} is not a {names}")
 
@@ -84,7 +87,7 @@ def _text(value: object) -> str:
     return json.dumps(value) if isinstance(value, (bool, dict)) else str(value)
 
 
-def _describe_model(path: Path) -> dict[str, Any]:
+def _describe_model(path: Path, _: argparse.Namespace) -> dict[str, Any]:
     model = load_model(path)
     config = config_to(model.pipeline)
     return {
@@ -116,4 +119,7 @@ def _settings(section: Any) -> dict[str, Any]:
     return {key: list(v) if isinstance(v, tuple) else v for key, v in vars(section).items()}
 
 
-KINDS = (Kind("model file (.npz)", lambda path: path.suffix == ".npz", _describe_model),)
+KINDS = (
+    Kind("model file (.npz)", lambda path: path.suffix == ".npz", _describe_model),
+    Kind("recording", is_recording, describe_recording),
+)

@@ -13,11 +13,13 @@ from cello3d_ros.errors import Cello3dError
 
 VERBS = {
     "estimate": "register one pair of files and predict its covariance",
-    "info": "say what a model holds",
+    "info": "say what a model or a recording holds",
+    "convert": "turn any recording into a rosbag2, a KITTI folder or plain clouds",
     "simulate": "scan a simulated world into a rosbag2",
     "sample": "sample ICP on every pair of recordings into a dataset",
     "train": "learn a model from datasets",
     "evaluate": "judge covariances beside every baseline",
+    "replay": "run the estimator over a recording, without ROS",
     "demo": "replay a bag through the node and judge its answers",
 }
 

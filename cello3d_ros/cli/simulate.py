@@ -1,23 +1,38 @@
-"""``cello3d simulate WORLD --out BAG``: scan a simulated world into a rosbag2."""
+"""``cello3d simulate WORLD --out BAG``: scan a simulated world into a rosbag2, or many."""
 
 from __future__ import annotations
 
 import argparse
-import sys
+import shlex
+from dataclasses import fields, replace
 from pathlib import Path
 
-from cello3d_ros.recordings.scanner import SCANNERS
+from cello3d_ros.cli.sources import with_progress
+from cello3d_ros.errors import RecordingError
+from cello3d_ros.recordings.scanner import SCANNERS, Scanner
 from cello3d_ros.recordings.simulation import Simulation
 from cello3d_ros.recordings.worlds import WORLDS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
-    parser.add_argument("world", metavar="WORLD", choices=WORLDS, help=", ".join(WORLDS))
+    names = ", ".join(WORLDS)
+    parser.add_argument("world", metavar="WORLD", type=_world, help=f"{names} or a YAML file")
     parser.add_argument("--seed", type=int, default=0, help="seed of layout, path and noise")
+    parser.add_argument(
+        "--seeds", type=int, metavar="N", help="N bags OUT/WORLD-SEED, of this and later seeds"
+    )
     parser.add_argument("--scans", type=int, default=25, help="number of scans, 0.5 s apart")
+    parser.add_argument("--path", type=Path, metavar="FILE", help="TUM poses of the sensor")
     parser.add_argument(
         "--scanner", choices=SCANNERS, default="spinning32", help="kind of lidar (spinning32)"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="change a property of the scanner, such as range_noise_m=0.03",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="BAG", help="rosbag2 folder to make (mcap)"
@@ -25,20 +40,49 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Write the bag.  Raises RecordingError if its name is taken or Open3D is missing."""
-    from tqdm import tqdm
-
+    """Write the bags.  Raises RecordingError if a name is taken or Open3D is missing."""
     from cello3d_ros.recordings.bag import write_bag
 
-    simulation = Simulation(
-        arguments.world, arguments.seed, arguments.scans, SCANNERS[arguments.scanner]
-    )
-    progress = tqdm(
-        simulation, desc=simulation.name, unit="scan", disable=not sys.stderr.isatty(), leave=False
-    )
+    scanner = changed(SCANNERS[arguments.scanner], arguments.set)
+    n_seeds = 1 if arguments.seeds is None else arguments.seeds
+    if n_seeds < 1:
+        raise RecordingError(f"--seeds must be at least 1: {n_seeds}")
+    for seed in range(arguments.seed, arguments.seed + n_seeds):
+        simulation = Simulation(
+            str(arguments.world), seed, arguments.scans, scanner, arguments.path
+        )
+        out = arguments.out if arguments.seeds is None else arguments.out / simulation.name
+        progress = with_progress(simulation, len(simulation), simulation.name)
+        write_bag(out, progress, provenance={"made_by": _command(arguments, seed)})
+        print(f"{out}: {len(simulation)} scans of {simulation.name}")
+
+
+def changed(scanner: Scanner, settings: list[str]) -> Scanner:
+    """Return a scanner with some properties changed.  Raises RecordingError or ConfigError."""
+    known = {field.name: getattr(scanner, field.name) for field in fields(scanner)}
+    values = {}
+    for setting in settings:
+        name, _, text = setting.partition("=")
+        if name not in known:
+            raise RecordingError(f"--set {setting}: known are {', '.join(known)}")
+        try:
+            values[name] = type(known[name])(text)
+        except ValueError:
+            raise RecordingError(f"--set {setting}: {text!r} is no number") from None
+    return replace(scanner, **values)
+
+
+def _world(text: str) -> str:
+    if text in WORLDS or text.endswith((".yaml", ".yml")):
+        return text
+    raise argparse.ArgumentTypeError(f"{text!r} is not {', '.join(WORLDS)} or a YAML file")
+
+
+def _command(arguments: argparse.Namespace, seed: int) -> str:
     command = (
-        f"cello3d simulate {arguments.world} --seed {arguments.seed} --scans {arguments.scans} "
+        f"cello3d simulate {shlex.quote(arguments.world)} --seed {seed} --scans {arguments.scans} "
         f"--scanner {arguments.scanner}"
     )
-    write_bag(arguments.out, progress, provenance={"made_by": command})
-    print(f"{arguments.out}: {len(simulation)} scans of {simulation.name}")
+    if arguments.path is not None:
+        command += f" --path {shlex.quote(str(arguments.path))}"
+    return command + "".join(f" --set {shlex.quote(setting)}" for setting in arguments.set)

@@ -109,7 +109,7 @@ def _build(points: Array, order: Indices) -> tuple[Array, Indices]:
             starts[2 * i - 1] = (starts[i - 1] + starts[i]) // 2
         for i in range(n_nodes):
             axis = int(np.argmax(level[i, 3:] - level[i, :3]))
-            _select(points, order, starts[2 * i], starts[2 * i + 2] - 1, starts[2 * i + 1], axis)
+            select(points, order, starts[2 * i], starts[2 * i + 2] - 1, starts[2 * i + 1], axis)
         n_nodes *= 2
 
 
@@ -128,7 +128,7 @@ def _bound(points: Array, order: Indices, lo: int, hi: int, box: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _select(points: Array, order: Indices, lo: int, hi: int, middle: int, axis: int) -> None:
+def select(points: Array, order: Indices, lo: int, hi: int, middle: int, axis: int) -> None:
     """Partition order[lo..hi] so that order[middle] is where sorting by ``axis`` would put it."""
     while lo < hi:
         pivot = points[order[(lo + hi) // 2], axis]

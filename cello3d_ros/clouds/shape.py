@@ -88,27 +88,22 @@ def _local_shape(
     stack = np.empty((64, 2))
     distances2 = np.empty(k)
     indices = np.empty(k, np.int64)
-    covariance = np.empty((3, 3))
-    vectors = np.empty((3, 3))
     for i in range(stop - start):
         x, y, z = points[start + i, 0], points[start + i, 1], points[start + i, 2]
         nearest_one(tree, x, y, z, np.inf, -1.0, distances2, indices, stack)
-        _covariance(points, indices, x, y, z, covariance)
-        _eigen(covariance, vectors)
-        first, second, third = _descending(covariance)
-        s1 = math.sqrt(max(covariance[first, first], 0.0))
-        s2 = math.sqrt(max(covariance[second, second], 0.0))
-        s3 = math.sqrt(max(covariance[third, third], 0.0))
-        normals[i] = vectors[:, third]
+        xx, yy, zz, xy, xz, yz = _covariance(points, indices, x, y, z)
+        largest, middle, least, normal = _eigen(xx, yy, zz, xy, xz, yz)
+        s1, s2, s3 = math.sqrt(largest), math.sqrt(middle), math.sqrt(least)
+        normals[i, 0], normals[i, 1], normals[i, 2] = normal
         planarity[i] = (s2 - s3) / s1 if s1 > 0.0 else 0.0
         cylindricality[i] = (s1 - s2) / s1 if s1 > 0.0 else 0.0
 
 
 @njit(cache=True, nogil=True)
 def _covariance(
-    points: Array, indices: Indices, x: float, y: float, z: float, covariance: Array
-) -> None:
-    """Fill the 3x3 covariance of the points at ``indices``, taken relative to (x, y, z)."""
+    points: Array, indices: Indices, x: float, y: float, z: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return xx, yy, zz, xy, xz, yz of the points at ``indices``, taken relative to (x, y, z)."""
     n = 0
     mx = my = mz = xx = xy = xz = yy = yz = zz = 0.0
     for index in indices:
@@ -126,52 +121,66 @@ def _covariance(
         yz += dy * dz
         zz += dz * dz
     mx, my, mz = mx / n, my / n, mz / n
-    covariance[0, 0] = xx / n - mx * mx
-    covariance[1, 1] = yy / n - my * my
-    covariance[2, 2] = zz / n - mz * mz
-    covariance[0, 1] = covariance[1, 0] = xy / n - mx * my
-    covariance[0, 2] = covariance[2, 0] = xz / n - mx * mz
-    covariance[1, 2] = covariance[2, 1] = yz / n - my * mz
+    return (
+        xx / n - mx * mx,
+        yy / n - my * my,
+        zz / n - mz * mz,
+        xy / n - mx * my,
+        xz / n - mx * mz,
+        yz / n - my * mz,
+    )
 
 
 @njit(cache=True, nogil=True)
-def _eigen(matrix: Array, vectors: Array) -> None:
-    """Diagonalise a symmetric 3x3 matrix in place by cyclic Jacobi rotations.
+def _eigen(
+    xx: float, yy: float, zz: float, xy: float, xz: float, yz: float
+) -> tuple[float, float, float, tuple[float, float, float]]:
+    """Return the eigenvalues of a covariance, descending, and the direction of the least.
 
-    The eigenvalues end on the diagonal, unsorted, their vectors in the columns of ``vectors``.
+    Cyclic Jacobi rotations, until what is left off the diagonal moves nothing in double precision:
+    it enters the eigenvalues squared.
     """
-    vectors[:] = np.eye(3)
-    scale = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
+    ax, ay, az = 1.0, 0.0, 0.0  # the directions a, b, c that become the eigenvectors of xx, yy, zz
+    bx, by, bz = 0.0, 1.0, 0.0
+    cx, cy, cz = 0.0, 0.0, 1.0
+    small = 1e-24 * (xx + yy + zz) ** 2
     for _ in range(30):
-        off = abs(matrix[0, 1]) + abs(matrix[0, 2]) + abs(matrix[1, 2])
-        if off <= 1e-16 * scale:
-            return
-        for p in range(2):
-            for q in range(p + 1, 3):
-                if matrix[p, q] == 0.0:
-                    continue
-                theta = (matrix[q, q] - matrix[p, p]) / (2.0 * matrix[p, q])
-                t = math.copysign(1.0, theta) / (abs(theta) + math.hypot(theta, 1.0))
-                c = 1.0 / math.sqrt(t * t + 1.0)
-                s = t * c
-                for i in range(3):
-                    a, b = matrix[i, p], matrix[i, q]
-                    matrix[i, p], matrix[i, q] = c * a - s * b, s * a + c * b
-                for i in range(3):
-                    a, b = matrix[p, i], matrix[q, i]
-                    matrix[p, i], matrix[q, i] = c * a - s * b, s * a + c * b
-                    a, b = vectors[i, p], vectors[i, q]
-                    vectors[i, p], vectors[i, q] = c * a - s * b, s * a + c * b
+        if xy * xy + xz * xz + yz * yz <= small:
+            break
+        xx, yy, xz, yz, c, s = _rotated(xx, yy, xy, xz, yz)
+        xy = 0.0
+        ax, bx = c * ax - s * bx, s * ax + c * bx
+        ay, by = c * ay - s * by, s * ay + c * by
+        az, bz = c * az - s * bz, s * az + c * bz
+        xx, zz, xy, yz, c, s = _rotated(xx, zz, xz, xy, yz)
+        xz = 0.0
+        ax, cx = c * ax - s * cx, s * ax + c * cx
+        ay, cy = c * ay - s * cy, s * ay + c * cy
+        az, cz = c * az - s * cz, s * az + c * cz
+        yy, zz, xy, xz, c, s = _rotated(yy, zz, yz, xy, xz)
+        yz = 0.0
+        bx, cx = c * bx - s * cx, s * bx + c * cx
+        by, cy = c * by - s * cy, s * by + c * cy
+        bz, cz = c * bz - s * cz, s * bz + c * cz
+    least, normal = xx, (ax, ay, az)
+    if yy < least:
+        least, normal = yy, (bx, by, bz)
+    if zz < least:
+        least, normal = zz, (cx, cy, cz)
+    largest = max(xx, yy, zz)
+    middle = max(min(xx, yy), min(max(xx, yy), zz))
+    return max(largest, 0.0), max(middle, 0.0), max(least, 0.0), normal
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _descending(matrix: Array) -> tuple[int, int, int]:
-    """Return the places of the diagonal's greatest, middle and least number."""
-    a, b, c = 0, 1, 2
-    if matrix[a, a] < matrix[b, b]:
-        a, b = b, a
-    if matrix[b, b] < matrix[c, c]:
-        b, c = c, b
-    if matrix[a, a] < matrix[b, b]:
-        a, b = b, a
-    return a, b, c
+def _rotated(
+    pp: float, qq: float, pq: float, pr: float, qr: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return pp, qq, pr, qr after the rotation in the plane of p and q that makes pq 0: (c, s)."""
+    if pq == 0.0:
+        return pp, qq, pr, qr, 1.0, 0.0
+    theta = 0.5 * (qq - pp) / pq
+    t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1.0))
+    c = 1.0 / math.sqrt(t * t + 1.0)
+    s = t * c
+    return pp - t * pq, qq + t * pq, c * pr - s * qr, s * pr + c * qr, c, s

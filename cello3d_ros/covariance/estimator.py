@@ -13,7 +13,8 @@ from cello3d_ros.covariance.descriptor import describe_overlap
 from cello3d_ros.covariance.model import Model, predict
 from cello3d_ros.errors import ModelError, NoOverlapError, RegistrationError
 from cello3d_ros.geometry.se3 import Array, inverse, transform
-from cello3d_ros.registration.icp import Registration, register
+from cello3d_ros.registration.backends import register
+from cello3d_ros.registration.icp import Registration
 from cello3d_ros.registration.overlap import find_overlap
 
 

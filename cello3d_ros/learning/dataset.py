@@ -14,7 +14,8 @@ import importlib.metadata
 import json
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -74,6 +75,11 @@ class PairRecord:
     overlap_ratio: float = 0.0
 
     @property
+    def n_samples(self) -> int:
+        """Registrations of the pair, with and without an answer."""
+        return len(self.xi) + self.n_failed
+
+    @property
     def key(self) -> tuple[str, int, int]:
         """Name of the pair: recording, reference, reading."""
         return self.recording, self.i, self.j
@@ -121,13 +127,25 @@ class Dataset:
 
     def has(self, recording: str, i: int, j: int) -> bool:
         """Return whether the pair is there and undamaged."""
+        return self.outcome(recording, i, j) is not None
+
+    def outcome(self, recording: str, i: int, j: int) -> str | None:
+        """Return why a pair was rejected, "" if it was not, None if it is missing or damaged."""
         if not self._file(recording, i, j).is_file():
-            return False
+            return None
         try:
-            self.read(recording, i, j)
+            record = self.read(recording, i, j)
         except DatasetError:
-            return False
-        return True
+            return None
+        return "" if record.accepted else record.reason
+
+    def outcomes(
+        self, recording: str, pairs: Sequence[tuple[int, int]], n_threads: int = 1
+    ) -> dict[tuple[int, int], str]:
+        """Return the outcome of each pair (i, j) that is there and undamaged."""
+        with ThreadPoolExecutor(max(1, n_threads)) as pool:
+            found = pool.map(lambda ij: self.outcome(recording, *ij), pairs)
+            return {ij: outcome for ij, outcome in zip(pairs, found) if outcome is not None}
 
     def read(self, recording: str, i: int, j: int) -> PairRecord:
         """Return one record.  Raises DatasetError if it is missing or damaged."""
@@ -146,10 +164,12 @@ class Dataset:
     def write(self, record: PairRecord) -> None:
         """Store one record, in place of an older one.  Raises DatasetError on unfit values."""
         path = self._file(*record.key)
-        path.parent.mkdir(exist_ok=True)
         try:
             _check(record)
+            path.parent.mkdir(exist_ok=True)
             write_arrays(path, _packed(record))
+        except OSError as error:
+            raise DatasetError(f"cannot write {path}: {error.strerror}") from None
         except ModelError as error:
             raise DatasetError(str(error)) from None
         except (ValueError, TypeError) as error:
@@ -181,10 +201,13 @@ def open_dataset(
     """
     path = Path(path)
     if create:
-        for leftover in [*path.glob(".*.tmp"), *path.glob("pairs/.*.tmp")]:
-            leftover.unlink(missing_ok=True)
-        if not (path / "manifest.json").exists():
-            _begin(path, pipeline or Pipeline(), sampling or SamplingConfig())
+        try:
+            for leftover in [*path.glob(".*.tmp"), *path.glob("pairs/.*.tmp")]:
+                leftover.unlink(missing_ok=True)
+            if not (path / "manifest.json").exists():
+                _begin(path, pipeline or Pipeline(), sampling or SamplingConfig())
+        except OSError as error:
+            raise DatasetError(f"cannot write {path}: {error.strerror}") from None
     dataset = Dataset(path, _read_manifest(path))
     theirs = _configuration(dataset.pipeline, dataset.sampling)
     ours = _configuration(pipeline or dataset.pipeline, sampling or dataset.sampling)
@@ -243,7 +266,10 @@ def _write_manifest(path: Path, manifest: dict[str, Any]) -> None:
     text = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     partial = path / f".manifest.json.{os.getpid()}.tmp"
     try:
-        partial.write_text(text, encoding="utf-8")
+        with open(partial, "w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
         os.replace(partial, path / "manifest.json")
     except OSError as error:
         raise DatasetError(f"cannot write {path / 'manifest.json'}: {error.strerror}") from None

@@ -21,7 +21,8 @@ from cello3d_ros.learning.dataset import Dataset, PairRecord
 
 Indices = NDArray[np.intp]
 
-_FREE = ("seed", "n_samples", "max_gap")  # sampling settings in which datasets may differ
+# sampling settings in which datasets may differ
+_FREE = ("seed", "n_samples", "min_samples", "precision", "max_gap")
 _ROWS, _COLUMNS = np.triu_indices(6)
 _MAX_SAMPLES = 200  # errors of each pair kept for the coverage
 

@@ -1,10 +1,18 @@
-"""Brute force: the distribution of ICP's results on one pair of clouds (Sec. IV-D)."""
+"""Brute force: the distribution of ICP's results on one pair of clouds (Sec. IV-D).
+
+A pair is worked on in three steps, each a pure function, so that they may run anywhere and give
+the same bits: ``describe_pair``, ``register_block`` for each range of its registrations, and
+``finish_pair``.  Registration k of a pair has a start and a seed of its own, whatever the blocks.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import islice, pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,10 +24,29 @@ from cello3d_ros.geometry.gaussian import is_positive_definite, sampled_covarian
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log
 from cello3d_ros.learning.clustering import nearest_cluster, offset
 from cello3d_ros.learning.dataset import PairRecord
+from cello3d_ros.learning.noise import register_many_noisy
+from cello3d_ros.learning.precision import eigenvalue_errors
 from cello3d_ros.recordings.recording import Recording, Scan
-from cello3d_ros.registration.icp import register, register_many
+from cello3d_ros.registration.backends import register, register_many
 
+PENDING = "not_sampled"  # the reason of a record that is described and no more
+BLOCK = 500  # registrations between two reports of progress
+_GROWTH = 1.25  # of the number of samples from one look at the precision to the next
 _FEWEST_KEPT = 12  # twice the dimensions: fewer make no covariance worth learning
+
+Prepared = tuple[Cloud | CloudError, Array]  # a scan's cloud, or why it has none; its true pose
+Progress = Callable[[int], None]  # told how many registrations were done since the last call
+
+
+class Block(NamedTuple):
+    """What some of a pair's registrations found.
+
+    xi: (n, 6) errors about ground truth of those with an answer, in the order of their numbers.
+    """
+
+    xi: Array
+    n_converged: int
+    n_failed: int
 
 
 def sample_recording(
@@ -28,23 +55,66 @@ def sample_recording(
     pipeline: Pipeline,
     sampling: SamplingConfig,
     n_threads: int = 1,
+    progress: Progress = lambda n: None,
 ) -> Iterator[PairRecord]:
     """Sample pairs (i, j) of a recording, some or all of ``pairs``, in the order of j.
 
     One pass that remembers ``max_gap`` scans.  Each record follows from the recording, its name
     and the settings alone: which others are done and the number of threads do not matter.
-    Raises RecordingError when a scan has no ground truth.
+    Raises RecordingError when a scan has no ground truth or the recording ends before the last
+    pair; what was yielded before stands.
     """
     by_reading = {j: [i for i, reading in todo if reading == j] for _, j in todo}
     needed = {index for ij in todo for index in ij}
-    window: dict[int, tuple[Cloud | CloudError, Array]] = {}
-    for j, scan in enumerate(recording):
+    window: dict[int, Prepared] = {}
+    n_read = 0
+    for j, scan in enumerate(islice(recording, max(needed, default=-1) + 1)):
+        n_read = j + 1
         window.pop(j - sampling.max_gap - 1, None)
         if j not in needed:
             continue
-        window[j] = _prepared(scan, recording.name, j, pipeline, sampling)
+        window[j] = prepare_scan(scan, recording.name, j, pipeline, sampling)
         for i in by_reading.get(j, []):
-            yield _sample_window(recording.name, i, j, window, pipeline, sampling, n_threads)
+            yield sample_prepared(
+                recording.name, i, j, window[i], window[j], pipeline, sampling, n_threads, progress
+            )
+    check_complete(recording.name, n_read, needed)
+
+
+def sample_prepared(
+    recording: str,
+    i: int,
+    j: int,
+    reference: Prepared,
+    reading: Prepared,
+    pipeline: Pipeline,
+    sampling: SamplingConfig,
+    n_threads: int = 1,
+    progress: Progress = lambda n: None,
+) -> PairRecord:
+    """Sample one pair of prepared scans; a scan without a cloud makes a rejected pair."""
+    T_mean = _between(reference, reading)
+    if isinstance(reference[0], CloudError) or isinstance(reading[0], CloudError):
+        return _without_cloud(recording, i, j, T_mean)
+    return sample_pair(
+        recording, i, j, reading[0], reference[0], T_mean, pipeline, sampling, n_threads, progress
+    )
+
+
+def describe_prepared(
+    recording: str,
+    i: int,
+    j: int,
+    reference: Prepared,
+    reading: Prepared,
+    pipeline: Pipeline,
+    sampling: SamplingConfig,
+) -> PairRecord:
+    """Describe one pair of prepared scans as ``describe_pair`` does."""
+    T_mean = _between(reference, reading)
+    if isinstance(reference[0], CloudError) or isinstance(reading[0], CloudError):
+        return _without_cloud(recording, i, j, T_mean)
+    return describe_pair(recording, i, j, reading[0], reference[0], T_mean, pipeline, sampling)
 
 
 def sample_pair(
@@ -57,45 +127,130 @@ def sample_pair(
     pipeline: Pipeline,
     sampling: SamplingConfig,
     n_threads: int = 1,
+    progress: Progress = lambda n: None,
 ) -> PairRecord:
-    """Register one pair ``n_samples`` times and take the covariance about ground truth.
+    """Register one pair many times and take the covariance about ground truth.
 
     T_mean: (4, 4), true T_ref_read.  Each start is ``T_mean exp(xi)``, xi ~ N(0, variance I), and
-    each registration draws its own subsamples.  The pair is described where ICP ends when it
-    starts from the truth, as it will be online.  Source: Sec. IV-D, V-A.
+    each registration draws its own subsamples.  There are ``n_samples`` of them, or fewer where
+    ``precision`` is reached before: the record is then that of the smaller ``n_samples``.
+    Source: Sec. IV-D, V-A.
     """
-    seed = [sampling.seed, _name_seed(recording), i, j]
-    base = PairRecord(
-        recording=recording, i=i, j=j, accepted=False, T_mean=T_mean, reason="not sampled"
-    )
-    at_truth = register(reading, reference, T_mean, pipeline.icp, np.random.default_rng(seed))
+    record = describe_pair(recording, i, j, reading, reference, T_mean, pipeline, sampling)
+    if record.reason != PENDING:
+        return record
+    blocks: list[Block] = []
+    for start, stop in pairwise([0, *stops(sampling)]):
+        blocks.append(
+            register_block(record, reading, reference, pipeline, sampling, start, stop, n_threads)
+        )
+        progress(stop - start)
+        if sampling.precision > 0.0 and stop < sampling.n_samples:
+            finished = finish_pair(record, blocks, sampling)
+            if is_precise(finished, sampling.precision):
+                return finished
+    return finish_pair(record, blocks, sampling)
+
+
+def stops(sampling: SamplingConfig) -> list[int]:
+    """Return after how many registrations of a pair to report or, with ``precision``, to look."""
+    if sampling.precision <= 0.0:
+        return [*range(BLOCK, sampling.n_samples, BLOCK), sampling.n_samples]
+    found = [min(sampling.min_samples, sampling.n_samples)]
+    while found[-1] < sampling.n_samples:
+        found.append(min(math.ceil(_GROWTH * found[-1]), sampling.n_samples))
+    return found
+
+
+def describe_pair(
+    recording: str,
+    i: int,
+    j: int,
+    reading: Cloud,
+    reference: Cloud,
+    T_mean: Array,
+    pipeline: Pipeline,
+    sampling: SamplingConfig,
+) -> PairRecord:
+    """Return a record with everything but samples, its reason PENDING; or a rejected one.
+
+    The pair is described where ICP ends when it starts from the truth, as it will be online.
+    """
+    base = PairRecord(recording=recording, i=i, j=j, accepted=False, T_mean=T_mean, reason=PENDING)
+    rng = np.random.default_rng(_pair_seed(base, sampling))
+    at_truth = register(reading, reference, T_mean, pipeline.icp, rng)
     try:
         pair = describe(reading, reference, at_truth.T_ref_read, pipeline, sampling.n_rotations)
     except NoOverlapError:
         return replace(base, reason="no_overlap")
     except RegistrationError:
         return replace(base, reason="singular")
-    starts = np.random.default_rng([*seed, 0]).normal(
-        scale=np.sqrt(sampling.variance), size=(sampling.n_samples, 6)
-    )
-    seeds = [[*seed, 1, k] for k in range(sampling.n_samples)]
-    results = register_many(
-        reading, reference, T_mean @ exp(starts), seeds, pipeline.icp, n_threads
-    )
-    answers = [r for r in results if r.reason in ("", "max_iterations")]
-    xi = log(inverse(T_mean) @ np.array([r.T_ref_read for r in answers]).reshape(-1, 4, 4))
-    record = replace(
+    return replace(
         base,
-        xi=xi,
-        kept=np.zeros(len(xi), np.bool_),
-        n_converged=sum(r.converged for r in answers),
-        n_failed=len(results) - len(answers),
         overlap_ratio=pair.overlap_ratio,
         descriptors=pair.descriptors.astype(np.float32),
         rotations_rad=2.0 * np.pi * np.arange(sampling.n_rotations) / sampling.n_rotations,
         shapes=pair.shapes,
     )
+
+
+def register_block(
+    record: PairRecord,
+    reading: Cloud,
+    reference: Cloud,
+    pipeline: Pipeline,
+    sampling: SamplingConfig,
+    start: int,
+    stop: int,
+    n_threads: int = 1,
+) -> Block:
+    """Do the registrations ``start`` to ``stop - 1`` of a described pair.
+
+    A registration without an answer, or with one that is not finite, is counted and left out.
+    """
+    seed, T_mean = _pair_seed(record, sampling), record.T_mean
+    starts = np.random.default_rng([*seed, 0]).normal(
+        scale=np.sqrt(sampling.variance), size=(stop, 6)
+    )[start:]
+    T_inits = T_mean @ exp(starts)
+    seeds = [[*seed, 1, k] for k in range(start, stop)]
+    if sampling.noise_m > 0.0:
+        results = register_many_noisy(
+            reading, reference, T_inits, seeds, pipeline.icp, sampling.noise_m, n_threads
+        )
+    else:
+        results = register_many(reading, reference, T_inits, seeds, pipeline.icp, n_threads)
+    answers = [
+        result
+        for result in results
+        if result.reason in ("", "max_iterations") and np.isfinite(result.T_ref_read).all()
+    ]
+    T_found = np.array([result.T_ref_read for result in answers]).reshape(-1, 4, 4)
+    return Block(
+        log(inverse(T_mean) @ T_found),
+        sum(result.converged for result in answers),
+        stop - start - len(answers),
+    )
+
+
+def finish_pair(
+    record: PairRecord, blocks: Sequence[Block], sampling: SamplingConfig
+) -> PairRecord:
+    """Return the described pair with its samples: accepted, or the reason why not."""
+    xi = np.concatenate([block.xi for block in blocks])
+    record = replace(
+        record,
+        xi=xi,
+        kept=np.zeros(len(xi), np.bool_),
+        n_converged=sum(block.n_converged for block in blocks),
+        n_failed=sum(block.n_failed for block in blocks),
+    )
     return _judged(record, sampling)
+
+
+def is_precise(record: PairRecord, precision: float) -> bool:
+    """Return whether each eigenvalue of the covariance has at most this relative error."""
+    return record.accepted and bool((eigenvalue_errors(record.xi[record.kept]) <= precision).all())
 
 
 def _judged(record: PairRecord, sampling: SamplingConfig) -> PairRecord:
@@ -119,35 +274,43 @@ def _judged(record: PairRecord, sampling: SamplingConfig) -> PairRecord:
     return replace(record, kept=kept, covariance=Y, accepted=True, reason="")
 
 
-def _sample_window(
-    name: str,
-    i: int,
-    j: int,
-    window: dict[int, tuple[Cloud | CloudError, Array]],
-    pipeline: Pipeline,
-    sampling: SamplingConfig,
-    n_threads: int,
-) -> PairRecord:
-    (reference, T_i), (reading, T_j) = window[i], window[j]
-    T_mean = inverse(T_i) @ T_j
-    if isinstance(reference, CloudError) or isinstance(reading, CloudError):
-        return PairRecord(
-            recording=name, i=i, j=j, accepted=False, T_mean=T_mean, reason="too_few_points"
-        )
-    return sample_pair(name, i, j, reading, reference, T_mean, pipeline, sampling, n_threads)
-
-
-def _prepared(
+def prepare_scan(
     scan: Scan, name: str, index: int, pipeline: Pipeline, sampling: SamplingConfig
-) -> tuple[Cloud | CloudError, Array]:
-    """Return the scan's cloud, or why it has none, and its true pose."""
+) -> Prepared:
+    """Return the cloud of scan ``index`` of a recording, or why it has none, and its true pose.
+
+    Raises RecordingError when it has no true pose.
+    """
     if scan.T_world_sensor is None:
         raise RecordingError(f"{name}: scan {index} has no ground truth, sampling needs it")
     rng = np.random.default_rng([sampling.seed, _name_seed(name), index])
+    T_world_sensor = np.array(scan.T_world_sensor, order="C")
     try:
-        return prepare(scan.points, pipeline.cloud, rng), scan.T_world_sensor
+        return prepare(scan.points, pipeline.cloud, rng), T_world_sensor
     except CloudError as error:
-        return error, scan.T_world_sensor
+        return error, T_world_sensor
+
+
+def check_complete(name: str, n_read: int, needed: set[int]) -> None:
+    """Raise RecordingError when a recording ended after n_read scans and more are needed."""
+    if needed and n_read <= max(needed):
+        raise RecordingError(
+            f"{name}: ends early, after {n_read} scans: scan {max(needed)} is missing"
+        )
+
+
+def _between(reference: Prepared, reading: Prepared) -> Array:
+    return np.ascontiguousarray(inverse(reference[1]) @ reading[1])
+
+
+def _without_cloud(recording: str, i: int, j: int, T_mean: Array) -> PairRecord:
+    return PairRecord(
+        recording=recording, i=i, j=j, accepted=False, T_mean=T_mean, reason="too_few_points"
+    )
+
+
+def _pair_seed(record: PairRecord, sampling: SamplingConfig) -> list[int]:
+    return [sampling.seed, _name_seed(record.recording), record.i, record.j]
 
 
 def _name_seed(name: str) -> int:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +11,13 @@ import numpy as np
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.recordings.files import read_cloud
+from cello3d_ros.recordings import tables
+from cello3d_ros.recordings.files import read_columns, scan_of
+from cello3d_ros.recordings.odometry import PoseTrack
+from cello3d_ros.recordings.poses import check_order, rigid, stamps_of
 from cello3d_ros.recordings.recording import Scan
 
-_STEP_NS = 100_000_000  # KITTI's lidar turns 10 times a second
+STEP_NS = 100_000_000  # KITTI's lidar turns 10 times a second
 
 
 class KittiRecording:
@@ -34,11 +37,9 @@ class KittiRecording:
         if odd := [f.name for f in files if not f.stem.isdecimal()]:
             raise RecordingError(f"{self.folder}: velodyne/{odd[0]} is not named by a number")
         self._files = sorted((int(f.stem), f) for f in files)
-        poses, times = self.folder / "poses.txt", self.folder / "times.txt"
-        self._stamps_ns = _stamps(times, self._needed(times, _table(times, 1)))
-        self._T_world_sensor = None
-        if (rows := self._needed(poses, _table(poses, 12))) is not None:
-            self._T_world_sensor = _lidar_poses(rows, poses, _calibration(self.folder))
+        self._stamps_ns = self._read_stamps()
+        self.n_projected = 0
+        self._T_world_sensor = self._read_poses()
 
     @property
     def name(self) -> str:
@@ -50,65 +51,48 @@ class KittiRecording:
 
     def __iter__(self) -> Iterator[Scan]:
         for number, file in self._files:
-            stamps, poses = self._stamps_ns, self._T_world_sensor
-            yield Scan(
-                stamp_ns=number * _STEP_NS if stamps is None else stamps[number],
-                points=read_cloud(file),
-                T_world_sensor=None if poses is None else poses[number].copy(),
-            )
+            poses = self._T_world_sensor
+            scan = scan_of(read_columns(file), self._stamp(number), file)
+            yield replace(scan, T_world_sensor=None if poses is None else poses[number].copy())
 
-    def _needed(self, path: Path, rows: Array | None) -> Array | None:
-        """Return the rows, after checking that each scan has one."""
+    def track(self) -> PoseTrack | None:
+        """Return the ground truth at the stamps, if there is any."""
+        poses = self._T_world_sensor
+        if poses is None:
+            return None
+        stamps = [self._stamp(number) for number, _ in self._files]
+        return PoseTrack.of_poses(stamps, poses[[number for number, _ in self._files]])
+
+    def _stamp(self, number: int) -> int:
+        return number * STEP_NS if self._stamps_ns is None else self._stamps_ns[number]
+
+    def _read_stamps(self) -> list[int] | None:
+        path = self.folder / "times.txt"
+        if not path.exists():
+            return None
+        data = tables.read_bytes(path)
+        self._check_enough(path, len(tables.numbers(data, 1, path)))
+        return check_order(stamps_of(data, path), path)
+
+    def _read_poses(self) -> Array | None:
+        path = self.folder / "poses.txt"
+        if not path.exists():
+            return None
+        rows = tables.numbers(tables.read_bytes(path), 12, path)
+        self._check_enough(path, len(rows))
+        T_cam, self.n_projected = rigid(rows.reshape(-1, 3, 4), path)
+        Tr = _calibration(self.folder)
+        if np.array_equal(Tr, np.eye(4)):
+            return T_cam
+        return np.asarray(se3.inverse(Tr) @ T_cam @ Tr)
+
+    def _check_enough(self, path: Path, n_rows: int) -> None:
+        """Check that each scan has a row."""
         number, file = self._files[-1]
-        if rows is not None and number >= len(rows):
+        if number >= n_rows:
             raise RecordingError(
-                f"{path}: has {len(rows)} rows, but {file.name} needs row {number + 1}"
+                f"{path}: has {n_rows} rows, but {file.name} needs row {number + 1}"
             )
-        return rows
-
-
-def _table(path: Path, n_columns: int) -> Array | None:
-    """Return the numbers (rows, n_columns) of a text file, or None if there is none."""
-    if not path.exists():
-        return None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # an empty file: no rows
-            rows = np.loadtxt(path, dtype=np.float64, ndmin=2)
-    except (OSError, ValueError) as error:
-        reason = (str(error).splitlines() or [""])[0]
-        raise RecordingError(f"{path}: cannot be read ({reason})") from error
-    if len(rows) and rows.shape[1] != n_columns:
-        raise RecordingError(f"{path}: has {rows.shape[1]} columns, expected {n_columns}")
-    return np.asarray(rows.reshape(-1, n_columns))
-
-
-def _stamps(path: Path, rows: Array | None) -> list[int] | None:
-    if rows is None:
-        return None
-    stamps = rows[:, 0]
-    late = ~np.isfinite(stamps) | (np.diff(stamps, prepend=-np.inf) <= 0)
-    if late.any():
-        raise RecordingError(f"{path}: row {int(np.argmax(late)) + 1} does not follow in time")
-    return [round(float(seconds) * 1e9) for seconds in stamps]
-
-
-def _lidar_poses(rows: Array, path: Path, Tr: Array) -> Array:
-    """Return the poses (n, 4, 4) of the lidar; a row may be 1e-3 off a rotation, not more."""
-    T_cam = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_cam[:, :3] = rows.reshape(-1, 3, 4)
-    for k, T in enumerate(T_cam):
-        if not se3.is_rigid(T):
-            raise RecordingError(f"{path}: row {k + 1} is not a rotation and a translation")
-    return np.asarray(se3.inverse(Tr) @ _projected(T_cam) @ Tr)
-
-
-def _projected(T: Array) -> Array:
-    """Return the poses (n, 4, 4) with each rotation replaced by the nearest exact one."""
-    U, _, Vt = np.linalg.svd(T[:, :3, :3])
-    out = T.copy()
-    out[:, :3, :3] = U @ Vt
-    return out
 
 
 def _calibration(folder: Path) -> Array:
@@ -128,4 +112,4 @@ def _calibration(folder: Path) -> Array:
         Tr[:3] = np.reshape(values[0], (3, 4))
     if len(values[0]) != 12 or not se3.is_rigid(Tr):
         raise RecordingError(f"{path}: Tr is not a rotation and a translation of 12 numbers")
-    return np.asarray(_projected(Tr[None])[0])
+    return np.asarray(rigid(Tr[None], path).T[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.recordings.recording import Recording, Scan
 
 
 def drift_odometry(
@@ -42,6 +44,28 @@ def drift_odometry(
     return np.stack(out)
 
 
+def with_odometry(recording: Recording, seed: int = 0) -> Iterator[Scan]:
+    """Yield the scans; where a recording has no odometry, its ground truth made to drift.
+
+    Raises RecordingError where there is neither.
+    """
+    first = next(iter(recording), None)
+    if first is None:
+        raise RecordingError(f"{recording.name} holds no scan")
+    if first.T_odom_sensor is not None:
+        for scan in recording:
+            if scan.T_odom_sensor is not None:
+                yield scan
+        return
+    truth = [scan.T_world_sensor for scan in recording]
+    known = [T for T in truth if T is not None]
+    if len(known) < len(truth):
+        raise RecordingError(f"{recording.name} has neither odometry nor ground truth throughout")
+    drifted = drift_odometry(np.stack(known), np.random.default_rng(seed))
+    for scan, T in zip(recording, drifted, strict=True):
+        yield replace(scan, T_odom_sensor=T)
+
+
 class PoseTrack:
     """Stamped poses, looked up at any time between the first and the last."""
 
@@ -63,6 +87,14 @@ class PoseTrack:
         self.stamps_ns: NDArray[np.int64] = stamps[keep]
         self._rows: Array = rows[keep]
 
+    @classmethod
+    def of_poses(cls, stamps_ns: ArrayLike, T: ArrayLike) -> PoseTrack:
+        """Return the track of poses (n, 4, 4)."""
+        T = np.asarray(T, dtype=np.float64).reshape(-1, 4, 4)
+        if len(T) == 0:
+            return cls([], [])
+        return cls(stamps_ns, np.concatenate([T[:, :3, 3], se3.quaternion(T)], axis=1))
+
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
@@ -80,6 +112,30 @@ class PoseTrack:
         before, after = int(self.stamps_ns[k - 1]), int(self.stamps_ns[k])
         share = (stamp_ns - before) / (after - before)
         return se3.interpolate(self._pose(k - 1), self._pose(k), share)
+
+    def covers(self, first_ns: int, last_ns: int) -> bool:
+        """Return whether all times from the first to the last lie in the span of the track."""
+        return len(self) > 0 and bool(
+            self.stamps_ns[0] <= first_ns and last_ns <= self.stamps_ns[-1]
+        )
+
+    def motion(self, stamp_ns: int, after_s: ArrayLike) -> Array:
+        """Return ``T(stamp)^-1 T(stamp + after)`` (n, 4, 4), on the geodesics of SE(3).
+
+        Between two poses of the track ``T(t) = T_0 exp(s log(T_0^-1 T_1))``.  after_s: (n,), all
+        in the span of the track.
+        """
+        after = np.append(0.0, np.asarray(after_s, dtype=np.float64))
+        at_s = 1e-9 * (self.stamps_ns - stamp_ns).astype(np.float64)
+        if len(self) == 1:
+            return np.tile(np.eye(4), (len(after) - 1, 1, 1))
+        k = np.clip(np.searchsorted(at_s, after, side="right") - 1, 0, len(self) - 2)
+        first, last = int(k.min()), int(k.max())
+        knots = se3.pose(*np.split(self._rows[first : last + 2], [3], axis=1))
+        steps = se3.log(se3.inverse(knots[:-1]) @ knots[1:])
+        share = (after - at_s[k]) / (at_s[k + 1] - at_s[k])
+        T = knots[k - first] @ se3.exp(share[:, None] * steps[k - first])
+        return np.asarray(se3.inverse(T[0]) @ T[1:])
 
     def _pose(self, k: int) -> Array:
         return se3.pose(self._rows[k, :3], self._rows[k, 3:])

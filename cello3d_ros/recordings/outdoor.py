@@ -24,10 +24,10 @@ Ground = Callable[[ArrayLike], Array]  # (..., 2) -> (...,), height in metres
 
 def garden(rng: np.random.Generator) -> tuple[Mesh, Route]:
     """Build a pavilion that the route runs through, trees, hedges and a garden wall."""
-    ground = _ground(rng, wavelengths_m=(8.0, 30.0), std_m=0.18)
+    ground = uneven_ground(rng, wavelengths_m=(8.0, 30.0), std_m=0.18)
     ring = _ring(rng, radius_m=rng.uniform(7.5, 11.0), wobble=0.15)
     route = _route(ring, ground)
-    parts = [_surface(ground, 32.0, 0.03, rng)]
+    parts = [surface(ground, 32.0, 0.03, rng)]
     at = int(rng.integers(len(route.points) // 12, len(route.points) // 6))
     center = route.points[at]
     parts.append(_pavilion(center, route, rng))
@@ -35,17 +35,17 @@ def garden(rng: np.random.Generator) -> tuple[Mesh, Route]:
     parts += [
         box([sx * edge, 0.0, 0.6], [0.3, 2 * edge, 2.6]) for sx in (-1, 1) if rng.uniform() < 0.7
     ]
-    for place in _places(rng, 30, 2.0 * edge, 2.5):
+    for place in places(rng, 30, 2.0 * edge, 2.5):
         if route.distance(place) > 1.2 and np.linalg.norm(place - center[:2]) > 4.5:
             parts.append(_plant(np.array([*place, ground(place)]), route, rng))
-    return _clear_of(route, join(parts)), route
+    return clear_of(route, join(parts)), route
 
 
 def _plant(foot: Array, route: Route, rng: np.random.Generator) -> Mesh:
     """Return a tree, a bush or a cut hedge."""
     kind = rng.uniform()
     if kind < 0.6:
-        return _tree(foot, rng.uniform(4.0, 8.0), 220, route, rng)
+        return tree(foot, rng.uniform(4.0, 8.0), 220, route, rng)
     if kind < 0.85:
         return facets(raised(foot, 0.4), rng.uniform(0.4, 0.8, size=3), 150, 0.1, rng)
     size = [rng.uniform(1.0, 2.0), rng.uniform(0.3, 0.6), rng.uniform(0.6, 1.4)]
@@ -54,28 +54,30 @@ def _plant(foot: Array, route: Route, rng: np.random.Generator) -> Mesh:
 
 def wood(rng: np.random.Generator) -> tuple[Mesh, Route]:
     """Build a wood: trunks with branches and foliage, bushes, fallen logs, rough ground."""
-    ground = _ground(rng, wavelengths_m=(3.0, 25.0), std_m=rng.uniform(0.2, 0.4))
+    ground = uneven_ground(rng, wavelengths_m=(3.0, 25.0), std_m=rng.uniform(0.2, 0.4))
     ring = _ring(rng, radius_m=rng.uniform(9.0, 14.0), wobble=0.25)
     route = _route(ring, ground)
-    parts = [_surface(ground, 36.0, 0.06, rng)]
-    for place in _places(rng, int(rng.integers(110, 220)), 66.0, 1.5):
+    parts = [surface(ground, 36.0, 0.06, rng)]
+    for place in places(rng, int(rng.integers(110, 220)), 66.0, 1.5):
         if route.distance(place) < 0.8:
             continue
         foot = np.array([*place, ground(place)])
-        parts.append(_tree(foot, rng.uniform(5.0, 13.0), 160, route, rng))
-    for place in _places(rng, 60, 50.0, 1.0):
+        parts.append(tree(foot, rng.uniform(5.0, 13.0), 160, route, rng))
+    for place in places(rng, 60, 50.0, 1.0):
         foot = np.array([*place, ground(place) + 0.3])
         parts.append(facets(foot, rng.uniform(0.3, 0.9, size=3), 90, 0.1, rng))
-    for place in _places(rng, 6, 40.0, 3.0):
+    for place in places(rng, 6, 40.0, 3.0):
         along = rng.normal(size=2)
         end = place + rng.uniform(2.0, 5.0) * along / np.linalg.norm(along)
         if min(route.distance(np.linspace(place, end, 9))) > 0.8:
             low, high = ([*p, float(ground(p)) + 0.1] for p in (place, end))
             parts.append(frustum(low, high, 0.2, 0.13, 9))
-    return _clear_of(route, join(parts)), route
+    return clear_of(route, join(parts)), route
 
 
-def _ground(rng: np.random.Generator, wavelengths_m: tuple[float, float], std_m: float) -> Ground:
+def uneven_ground(
+    rng: np.random.Generator, wavelengths_m: tuple[float, float], std_m: float
+) -> Ground:
     """Return a sum of waves of random length and direction, of the given deviation."""
     n = 10
     length = np.exp(rng.uniform(np.log(wavelengths_m[0]), np.log(wavelengths_m[1]), size=n))
@@ -89,7 +91,7 @@ def _ground(rng: np.random.Generator, wavelengths_m: tuple[float, float], std_m:
     return height
 
 
-def _surface(ground: Ground, half_m: float, roughness_m: float, rng: np.random.Generator) -> Mesh:
+def surface(ground: Ground, half_m: float, roughness_m: float, rng: np.random.Generator) -> Mesh:
     """Return the ground as triangles of 0.5 m, each corner moved up or down a little."""
     x = np.arange(-half_m, half_m + 0.5, 0.5)
     z = ground(np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1))
@@ -112,7 +114,7 @@ def _route(ring: Array, ground: Ground) -> Route:
     return Route(points, closed=True)
 
 
-def _places(rng: np.random.Generator, n: int, side_m: float, apart_m: float) -> Array:
+def places(rng: np.random.Generator, n: int, side_m: float, apart_m: float) -> Array:
     """Return at most ``n`` random places (m, 2) of a square, no two nearer than ``apart_m``."""
     kept: list[Array] = []
     for place in rng.uniform(-side_m / 2, side_m / 2, size=(3 * n, 2)):
@@ -121,7 +123,7 @@ def _places(rng: np.random.Generator, n: int, side_m: float, apart_m: float) -> 
     return np.array(kept)
 
 
-def _tree(
+def tree(
     foot: Array, height: float, n_leaves: int, route: Route, rng: np.random.Generator
 ) -> Mesh:
     """Return a leaning trunk with branches, none across the route, and foliage at their ends."""
@@ -171,7 +173,7 @@ def _pavilion(center: Array, route: Route, rng: np.random.Generator) -> Mesh:
     return join(parts)
 
 
-def _clear_of(route: Route, mesh: Mesh) -> Mesh:
+def clear_of(route: Route, mesh: Mesh) -> Mesh:
     """Return the mesh without the small facets that hang over the route at a person's height."""
     corners = mesh.vertices[mesh.triangles]
     small = np.ptp(corners, axis=1).max(axis=1) < 0.3

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
 
+from numpy.typing import NDArray
+
+from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.se3 import Array
+
+if TYPE_CHECKING:
+    from cello3d_ros.recordings.odometry import PoseTrack
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,12 +23,33 @@ class Scan:
     points: (N, 3) finite float64, metres, sensor frame.
     T_world_sensor: (4, 4) ground truth, or None.
     T_odom_sensor: (4, 4) odometry at the stamp, or None.
+    intensity: (N,) float64 in the sensor's own unit, or None.
+    time_s: (N,) float64, when each point was measured, after the stamp; or None.
     """
 
     stamp_ns: int
     points: Array
     T_world_sensor: Array | None = None
     T_odom_sensor: Array | None = None
+    intensity: Array | None = None
+    time_s: Array | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("intensity", "time_s"):
+            values = getattr(self, name)
+            if values is not None and values.shape != (len(self.points),):
+                raise RecordingError(
+                    f"{name} of shape {values.shape} does not fit {len(self.points)} points"
+                )
+
+    def only(self, rows: NDArray[Any]) -> Scan:
+        """Return the scan with some of its points: a mask or indices, companions alike."""
+        return replace(
+            self,
+            points=self.points[rows],
+            intensity=None if self.intensity is None else self.intensity[rows],
+            time_s=None if self.time_s is None else self.time_s[rows],
+        )
 
 
 class Recording(Protocol):
@@ -33,6 +60,15 @@ class Recording(Protocol):
         """Short name: the folder or file without its ending."""
         ...
 
+    @property
+    def n_projected(self) -> int:
+        """How many poses were not quite rigid and were made so."""
+        ...
+
     def __len__(self) -> int: ...
 
     def __iter__(self) -> Iterator[Scan]: ...
+
+    def track(self) -> PoseTrack | None:
+        """Return the sensor's poses as densely as they are known, odometry before ground truth."""
+        ...

@@ -17,12 +17,15 @@ from cello3d_ros.recordings.meshes import Mesh
 class Scanner:
     """Beams and errors of a scanner; a scan is taken at one instant, without motion.
 
+    pattern: "spinning", beams at fixed elevations that turn about the vertical; or "tilting", a
+    fan of beams across (azimuth) that nods about the sensor's y axis through the elevations.
     range_noise_m: standard deviation of a range.
     missing_share: share of the returns that get lost whatever they hit.
     grazing_deg: angle of incidence (0 is head-on) beyond which the chance of a return falls,
     linearly in the cosine, to 0 at 90 degrees.
     """
 
+    pattern: str = "spinning"
     n_beams: int = 32
     min_elevation_deg: float = -25.0
     max_elevation_deg: float = 15.0
@@ -36,6 +39,7 @@ class Scanner:
 
     def __post_init__(self) -> None:
         laws = {
+            "pattern": self.pattern in ("spinning", "tilting"),
             "n_beams": self.n_beams >= 1,
             "min_elevation_deg": -90 <= self.min_elevation_deg <= self.max_elevation_deg,
             "max_elevation_deg": self.max_elevation_deg <= 90,
@@ -59,6 +63,9 @@ class Scanner:
         n = max(1, round(self.azimuth_span_deg / self.azimuth_step_deg))
         azimuth = np.radians((np.arange(n) + 0.5) / n - 0.5) * self.azimuth_span_deg
         e, a = (g.ravel() for g in np.meshgrid(elevation, azimuth, indexing="ij"))
+        if self.pattern == "tilting":
+            ahead = np.cos(a)
+            return np.stack([np.cos(e) * ahead, np.sin(a), np.sin(e) * ahead], axis=1)
         return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1)
 
 
@@ -73,6 +80,24 @@ SCANNERS = MappingProxyType(
         ),
         "wide": Scanner(
             n_beams=90, min_elevation_deg=-50, max_elevation_deg=85, azimuth_step_deg=1.2
+        ),
+        "tilting_hokuyo": Scanner(  # UTM-30LX on a tilting unit, thinned to a quarter
+            pattern="tilting",
+            n_beams=172,
+            min_elevation_deg=-60,
+            max_elevation_deg=60,
+            azimuth_step_deg=0.5,
+            azimuth_span_deg=270,
+            min_range_m=0.1,
+        ),
+        "narrow": Scanner(  # the field of view of a Livox Avia
+            n_beams=110,
+            min_elevation_deg=-38.6,
+            max_elevation_deg=38.6,
+            azimuth_step_deg=0.7,
+            azimuth_span_deg=70.4,
+            max_range_m=100.0,
+            range_noise_m=0.02,
         ),
     }
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -12,6 +13,7 @@ from cello3d_ros.errors import RecordingError
 from cello3d_ros.recordings import indoor, outdoor, staircase
 from cello3d_ros.recordings.meshes import Mesh
 from cello3d_ros.recordings.paths import Route
+from cello3d_ros.recordings.world_files import load_world
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,12 @@ WORLDS: MappingProxyType[str, Builder] = MappingProxyType(
 
 
 def build_world(name: str, rng: np.random.Generator) -> World:
-    """Return the world of that name; layout and sizes are drawn from ``rng``."""
+    """Return the world of that name or YAML file; what varies is drawn from ``rng``."""
+    if name.endswith((".yaml", ".yml")):
+        return World(Path(name).stem, *load_world(Path(name), rng))
     if name not in WORLDS:
-        raise RecordingError(f"there is no world {name!r}; known are {', '.join(WORLDS)}")
+        raise RecordingError(
+            f"there is no world {name!r}; known are {', '.join(WORLDS)} and YAML files"
+        )
     mesh, route = WORLDS[name](rng)
     return World(name, mesh, route)

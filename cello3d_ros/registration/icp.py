@@ -24,13 +24,15 @@ import numpy as np
 from numba import njit
 
 from cello3d_ros.clouds.filters import subsample
-from cello3d_ros.clouds.neighbors import Indices, KdTree, build_tree, nearest_one
+from cello3d_ros.clouds.neighbors import Indices
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.registration.search import Leaves, build_leaves, search, tree_order
 
 REASONS = ("", "max_iterations", "singular", "too_few_points")
 _SLACK = 1.2  # search beyond the last trim limit, in squared distance
+_N_BINS = 2048  # of the trim limit's histogram
 _CONVERGED, _MAX_ITERATIONS, _SINGULAR, _TOO_FEW_POINTS = range(4)
 
 
@@ -50,6 +52,16 @@ class Registration(NamedTuple):
     n_associations: int
 
 
+class _Pair(NamedTuple):
+    """Two sets of points as the kernels want them: in tree order, about the reference's mean."""
+
+    reading: Array
+    reference: Array
+    normals: Array
+    leaves: Leaves
+    mean: Array
+
+
 def icp(
     reading: Array, reference: Array, normals: Array, T_init: Array, config: IcpConfig
 ) -> Registration:
@@ -59,28 +71,7 @@ def icp(
     Never raises on geometry: a registration without an answer keeps the last pose it had and
     says why.
     """
-    k = config.n_neighbors
-    if len(reading) == 0 or len(reference) < k:
-        return Registration(T_init.copy(), 0, False, REASONS[_TOO_FEW_POINTS], math.nan, 0)
-    mean = reference.mean(axis=0)
-    tree = build_tree(reference - mean)
-    T = T_init.copy()
-    T[:3, 3] -= mean
-    status, n_iterations, rms, n_kept = _icp(
-        np.ascontiguousarray(reading),
-        tree,
-        np.ascontiguousarray(normals[tree.order]),
-        T,
-        k,
-        config.trim_ratio,
-        config.error_metric == "point_to_plane",
-        config.max_iterations,
-        config.n_smoothed,
-        config.rotation_epsilon_rad,
-        config.translation_epsilon_m,
-    )
-    T[:3, 3] += mean
-    return Registration(T, n_iterations, status == _CONVERGED, REASONS[status], rms, n_kept)
+    return _register_pair(_pair(reading, reference, normals), T_init, config)
 
 
 def register(
@@ -107,10 +98,19 @@ def register_many(
     """Register from many starts, each with subsamples of its own.
 
     T_inits: (n, 4, 4); seeds: n seeds of numpy's default generator.  Each result depends on its
-    own start and seed only, hence not on the number of threads.
+    own start and seed only, hence not on the number of threads.  Where the clouds are small
+    enough for every subsample to be the whole of both, they are put in order once.
     """
+    whole = None
+    if (
+        len(reading.points) <= config.n_reading_points
+        and 0 < len(reference.points) <= config.n_reference_points
+    ):
+        whole = _pair(reading.points, reference.points, reference.normals)
 
     def one(i: int) -> Registration:
+        if whole is not None:
+            return _register_pair(whole, T_inits[i], config)
         rng = np.random.default_rng(seeds[i])
         return register(reading, reference, T_inits[i], config, rng)
 
@@ -120,11 +120,46 @@ def register_many(
         return list(pool.map(one, range(len(T_inits))))
 
 
+def _pair(reading: Array, reference: Array, normals: Array) -> _Pair:
+    if len(reading) == 0 or len(reference) == 0:
+        none = np.empty((0, 3))
+        return _Pair(none, none, none, build_leaves(np.zeros((1, 3))), np.zeros(3))
+    mean = reference.mean(axis=0)
+    reading, reference = np.ascontiguousarray(reading), reference - mean
+    read, ref = tree_order(reading), tree_order(reference)
+    reference = reference[ref]
+    return _Pair(reading[read], reference, normals[ref], build_leaves(reference), mean)
+
+
+def _register_pair(pair: _Pair, T_init: Array, config: IcpConfig) -> Registration:
+    if len(pair.reading) == 0 or len(pair.reference) < config.n_neighbors:
+        return Registration(T_init.copy(), 0, False, REASONS[_TOO_FEW_POINTS], math.nan, 0)
+    T = T_init.copy()
+    T[:3, 3] -= pair.mean
+    status, n_iterations, rms, n_kept = _icp(
+        pair.reading,
+        pair.reference,
+        pair.normals,
+        pair.leaves,
+        T,
+        config.n_neighbors,
+        config.trim_ratio,
+        config.error_metric == "point_to_plane",
+        config.max_iterations,
+        config.n_smoothed,
+        config.rotation_epsilon_rad,
+        config.translation_epsilon_m,
+    )
+    T[:3, 3] += pair.mean
+    return Registration(T, n_iterations, status == _CONVERGED, REASONS[status], rms, n_kept)
+
+
 @njit(cache=True, nogil=True)
 def _icp(
     reading: Array,
-    tree: KdTree,
+    reference: Array,
     normals: Array,
+    leaves: Leaves,
     T: Array,
     k: int,
     trim_ratio: float,
@@ -146,13 +181,13 @@ def _icp(
     rms, n_kept, limit = np.nan, 0, np.inf
     for iteration in range(max_iterations):
         moved = start @ R.T + t
-        limit = _associate(moved, tree, trim_ratio, limit, distances2, indices)
+        limit = _associate(moved, leaves, trim_ratio, limit, distances2, indices)
         if to_plane:
             ok, dR, dt, rms, n_kept = _plane_step(
-                moved, tree.points, normals, distances2, indices, limit
+                moved, reference, normals, distances2, indices, limit
             )
         else:
-            ok, dR, dt, rms, n_kept = _point_step(moved, tree.points, distances2, indices, limit)
+            ok, dR, dt, rms, n_kept = _point_step(moved, reference, distances2, indices, limit)
         if not ok:
             return _SINGULAR, iteration, rms, n_kept
         t_new = dR @ t + dt
@@ -174,7 +209,7 @@ def _icp(
 @njit(cache=True, nogil=True)
 def _associate(
     moved: Array,
-    tree: KdTree,
+    leaves: Leaves,
     trim_ratio: float,
     last_limit: float,
     distances2: Array,
@@ -188,34 +223,38 @@ def _associate(
     rank among them is exact; when not, the search is done again without that bound.
     """
     rank = min(int(distances2.size * trim_ratio), distances2.size - 1)
-    if _search(moved, tree, _SLACK * last_limit, distances2, indices) <= rank:
-        _search(moved, tree, np.inf, distances2, indices)
-    return float(np.partition(distances2.ravel(), rank)[rank])
+    cap2 = _SLACK * last_limit
+    if search(moved, leaves, cap2, distances2, indices) <= rank:
+        cap2 = np.inf
+        search(moved, leaves, cap2, distances2, indices)
+    return _of_rank(distances2.ravel(), rank, cap2)
 
 
 @njit(cache=True, nogil=True)
-def _search(moved: Array, tree: KdTree, cap2: float, distances2: Array, indices: Indices) -> int:
-    """Fill the k nearest neighbours whose squared distance is below ``cap2``; count them.
+def _of_rank(values: Array, rank: int, most: float) -> float:
+    """Return the value that sorting would put at ``rank``, itself at most ``most``.
 
-    The neighbours of the step before are as good a set of k points as any: the k-th neighbour
-    cannot be farther than the farthest of them is now, so the search starts from that bound.
+    The values, not negative, are counted into bins of equal width, and only those of the one bin
+    that holds the rank are sorted.  Rounding cannot misplace any: a greater value never falls
+    into a lower bin.
     """
-    k = indices.shape[1]
-    stack = np.empty((64, 2))
-    points = tree.points
-    n_found = 0
-    for i in range(len(moved)):
-        x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
-        bound2 = cap2
-        if indices[i, k - 1] >= 0:
-            farthest2 = 0.0
-            for j in range(k):
-                p = indices[i, j]
-                dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
-                farthest2 = max(farthest2, dx * dx + dy * dy + dz * dz)
-            bound2 = min(bound2, np.nextafter(farthest2, np.inf))
-        n_found += nearest_one(tree, x, y, z, bound2, -1.0, distances2[i], indices[i], stack)
-    return n_found
+    scale = _N_BINS / most if most > 0.0 else np.inf
+    if not 0.0 < scale < np.inf:
+        return float(np.partition(values, rank)[rank])
+    counts = np.zeros(_N_BINS + 1, np.int64)
+    for value in values:
+        counts[int(min(value * scale, float(_N_BINS)))] += 1
+    chosen, before = 0, 0
+    while before + counts[chosen] <= rank:
+        before += counts[chosen]
+        chosen += 1
+    inside = np.empty(counts[chosen])
+    n_inside = 0
+    for value in values:
+        if int(min(value * scale, float(_N_BINS))) == chosen:
+            inside[n_inside] = value
+            n_inside += 1
+    return float(np.partition(inside, rank - before)[rank - before])
 
 
 @njit(cache=True, nogil=True)
@@ -227,11 +266,14 @@ def _plane_step(
     indices: Indices,
     limit: float,
 ) -> tuple[bool, Array, Array, float, int]:
-    """Solve the point-to-plane normal equations: ok, rotation, translation, RMS, count."""
-    A = np.zeros((6, 6))
-    b = np.zeros(6)
-    row = np.empty(6)
-    sum2 = 0.0
+    """Solve the point-to-plane normal equations: ok, rotation, translation, RMS, count.
+
+    A row is (c, n), c = p x n, its error r.  The sums stay in registers, one name each.
+    """
+    c00 = c10 = c11 = c20 = c21 = c22 = 0.0
+    n00 = n01 = n02 = n10 = n11 = n12 = n20 = n21 = n22 = 0.0
+    m00 = m10 = m11 = m20 = m21 = m22 = 0.0
+    b0 = b1 = b2 = b3 = b4 = b5 = sum2 = 0.0
     n_kept = 0
     for i in range(len(moved)):
         x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
@@ -240,17 +282,30 @@ def _plane_step(
                 break
             p = indices[i, j]
             nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
-            row[0] = y * nz - z * ny
-            row[1] = z * nx - x * nz
-            row[2] = x * ny - y * nx
-            row[3], row[4], row[5] = nx, ny, nz
+            cx, cy, cz = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
             r = (x - points[p, 0]) * nx + (y - points[p, 1]) * ny + (z - points[p, 2]) * nz
+            c00, c10, c20 = c00 + cx * cx, c10 + cy * cx, c20 + cz * cx
+            c11, c21, c22 = c11 + cy * cy, c21 + cz * cy, c22 + cz * cz
+            n00, n01, n02 = n00 + nx * cx, n01 + nx * cy, n02 + nx * cz
+            n10, n11, n12 = n10 + ny * cx, n11 + ny * cy, n12 + ny * cz
+            n20, n21, n22 = n20 + nz * cx, n21 + nz * cy, n22 + nz * cz
+            m00, m10, m20 = m00 + nx * nx, m10 + ny * nx, m20 + nz * nx
+            m11, m21, m22 = m11 + ny * ny, m21 + nz * ny, m22 + nz * nz
+            b0, b1, b2 = b0 - cx * r, b1 - cy * r, b2 - cz * r
+            b3, b4, b5 = b3 - nx * r, b4 - ny * r, b5 - nz * r
             sum2 += r * r
             n_kept += 1
-            for u in range(6):
-                b[u] -= row[u] * r
-                for v in range(u + 1):
-                    A[u, v] += row[u] * row[v]
+    A = np.array(  # the lower triangle is enough
+        [
+            [c00, 0.0, 0.0, 0.0, 0.0, 0.0],
+            [c10, c11, 0.0, 0.0, 0.0, 0.0],
+            [c20, c21, c22, 0.0, 0.0, 0.0],
+            [n00, n01, n02, m00, 0.0, 0.0],
+            [n10, n11, n12, m10, m11, 0.0],
+            [n20, n21, n22, m20, m21, m22],
+        ]
+    )
+    b = np.array([b0, b1, b2, b3, b4, b5])
     rms = math.sqrt(sum2 / max(n_kept, 1))
     ok = _solve(A, b)
     return ok, _rotation(b[:3]), b[3:], rms, n_kept

@@ -17,9 +17,9 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
-from cello3d_ros.errors import Cello3dError, RecordingError
+from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry.se3 import Array, interpolate
-from cello3d_ros.recordings.odometry import drift_odometry
+from cello3d_ros.recordings.odometry import with_odometry
 from cello3d_ros.recordings.recording import Recording, Scan
 from cello3d_ros.ros import messages
 from cello3d_ros.ros.diagnostics import ANSWERED, WAITING
@@ -220,33 +220,6 @@ def play(
     if rate_hz is not None and before is not None:
         _wait(player, before.stamp_ns, timeout_s)
     return replay
-
-
-def with_odometry(recording: Recording, seed: int = 0) -> Iterator[Scan]:
-    """Yield the scans; where a recording has no odometry, its ground truth made to drift.
-
-    Raises RecordingError where there is neither.
-    """
-    first = next(iter(recording), None)
-    if first is None:
-        raise RecordingError(f"{recording.name} holds no scan")
-    if first.T_odom_sensor is not None:
-        for scan in recording:
-            if scan.T_odom_sensor is not None:
-                yield scan
-        return
-    truth = [scan.T_world_sensor for scan in recording]
-    known = [T for T in truth if T is not None]
-    if len(known) < len(truth):
-        raise RecordingError(f"{recording.name} has neither odometry nor ground truth throughout")
-    drifted = drift_odometry(np.stack(known), np.random.default_rng(seed))
-    for scan, T in zip(recording, drifted, strict=True):
-        yield Scan(
-            stamp_ns=scan.stamp_ns,
-            points=scan.points,
-            T_world_sensor=scan.T_world_sensor,
-            T_odom_sensor=T,
-        )
 
 
 def _odometry_up_to(before: Scan | None, scan: Scan) -> Iterator[tuple[int, Array]]:

@@ -12,7 +12,8 @@ import pytest
 from cello3d_ros.cli import info
 from cello3d_ros.config import Config, config_to
 from cello3d_ros.covariance.model import constant_model, save_model
-from cello3d_ros.errors import Cello3dError, ModelError
+from cello3d_ros.errors import Cello3dError, ModelError, RecordingError
+from cello3d_ros.geometry import se3
 
 PROVENANCE = {
     "recordings": ["rooms-0", "wood-1"],
@@ -86,3 +87,69 @@ def test_a_damaged_model_is_one_sentence(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(ModelError, match="truncated or damaged"):
         info.run(parsed(str(path)))
+
+
+def a_bag(folder: Path) -> Path:
+    from cello3d_ros.recordings import Scan
+    from cello3d_ros.recordings.bag import write_bag
+
+    scans = [
+        Scan(
+            stamp_ns=10**18 + k * 500_000_000,
+            points=np.ones((10 * (k + 1), 3)),
+            T_world_sensor=se3.exp([2.0 * k, 0, 0, 0, 0, 0]),
+            T_odom_sensor=np.eye(4) if k < 2 else None,
+            intensity=np.zeros(10 * (k + 1)),
+            time_s=np.linspace(0.0, 0.1, 10 * (k + 1)),
+        )
+        for k in range(3)
+    ]
+    write_bag(folder / "walk", scans)
+    return folder / "walk"
+
+
+def test_a_bag_is_described_from_end_to_end(tmp_path: Path, capsys) -> None:
+    path = a_bag(tmp_path)
+    info.run(parsed(str(path), "--json"))
+    found = json.loads(capsys.readouterr().out)
+    assert (found["kind"], found["recording"], found["name"]) == ("recording", "ROS bag", "walk")
+    assert found["n_scans"] == found["n_scans_with_ground_truth"] == 3
+    assert found["n_scans_with_odometry"] == 2
+    assert found["n_scans_with_intensity"] == found["n_scans_with_point_times"] == 3
+    assert found["points_per_scan"] == {"min": 10, "median": 20.0, "max": 30, "total": 60}
+    assert found["duration_s"] == pytest.approx(1.0)
+    assert found["time_span_s"] == pytest.approx(0.1)
+    assert found["path_length_m"] == pytest.approx(4.0)
+    assert found["topics"]["/points"] == "3 sensor_msgs/msg/PointCloud2"
+    assert found["read_as"]["odometry"] == "/odom"
+
+
+def test_topics_can_be_named(tmp_path: Path, capsys) -> None:
+    info.run(parsed(str(a_bag(tmp_path)), "--odometry", "", "--json"))
+    found = json.loads(capsys.readouterr().out)
+    assert found["n_scans_with_odometry"] == 0
+    assert found["read_as"]["odometry"] is None
+
+
+def test_real_recordings_are_described(evaluation: Path, capsys) -> None:
+    info.run(parsed(str(evaluation / "data" / "street")))
+    text = capsys.readouterr().out
+    assert "KITTI folder" in text
+    assert "n_scans                    21" in text
+
+
+def test_a_damaged_recording_is_one_sentence(tmp_path: Path) -> None:
+    path = a_bag(tmp_path)
+    (path / "walk.mcap").write_bytes(b"")
+    with pytest.raises(RecordingError, match="walk: cannot be read"):
+        info.run(parsed(str(path)))
+    archive = tmp_path / "plain.zip"
+    archive.write_bytes(b"PK\3\4 not an archive")
+    with pytest.raises(RecordingError, match=r"plain\.zip: cannot be read"):
+        info.run(parsed(str(archive)))
+
+
+@pytest.mark.parametrize("extrinsic", [["0"] * 7, ["nan", "0", "0", "0", "0", "0", "1"]])
+def test_an_extrinsic_that_is_no_pose_is_refused(tmp_path: Path, extrinsic) -> None:
+    with pytest.raises(RecordingError, match="needs x y z and a unit quaternion"):
+        info.run(parsed(str(a_bag(tmp_path)), "--extrinsic", *extrinsic))

@@ -111,7 +111,7 @@ def test_every_verb_has_help(verb, capsys):
 
 
 def test_ctrl_c_is_130_and_one_line(monkeypatch, capsys):
-    def interrupted(path):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("cello3d_ros.cli.info.describe", interrupted)

@@ -1,6 +1,13 @@
 """The offline tools in a row: sample two recordings, train on them, use the model."""
 
+import contextlib
+import io
 import json
+import os
+import resource
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -114,3 +121,171 @@ def test_a_model_trained_on_samples_estimates(tmp_path, recordings, capsys):
     np.testing.assert_allclose(
         np.reshape(answer["T_ref_read"], (4, 4)), exp([0.2, 0.1, 0, 0, 0, 0.1]), atol=0.05
     )
+
+
+def started(tmp_path, recordings, out, *flags):
+    """Start the real command as a process of its own."""
+    command = [sys.executable, "-m", "cello3d_ros.cli.main", "sample", *recordings]
+    options = ["--out", str(out), "--config", str(tmp_path / "config.yaml"), "--jobs", "1"]
+    return subprocess.Popen(
+        [*command, *options, *flags],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+
+
+def files(folder):
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and not path.name.startswith(".")
+    }
+
+
+def test_killed_at_random_moments_the_dataset_is_that_of_an_undisturbed_run(tmp_path):
+    """kill -9, five times: after some pairs were written, a random part of a pair later."""
+    (tmp_path / "config.yaml").write_text(CONFIG.replace("n_samples: 20", "n_samples: 60"))
+    recordings = [write_kitti(tmp_path / "long", 0, n_scans=8)]
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert started(tmp_path, recordings, whole).wait(120) == 0
+    rng = np.random.default_rng(1)
+    n_killed = 0
+    for _ in range(5):
+        before = set(files(cut))
+        process = started(tmp_path, recordings, cut)
+        n_more, delay_s = rng.integers(0, 3), rng.uniform(0.0, 0.3)
+        while process.poll() is None and len(set(files(cut)) - before) < n_more:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(0.002)
+        with contextlib.suppress(subprocess.TimeoutExpired):  # the random moment
+            process.wait(delay_s)
+        process.kill()
+        process.communicate()
+        n_killed += process.returncode == -signal.SIGKILL
+        done = files(cut)
+        assert all(done[name] == content for name, content in files(whole).items() if name in done)
+        assert len(done) < len(files(whole))
+    assert n_killed == 5
+    assert started(tmp_path, recordings, cut).wait(120) == 0
+    assert files(cut) == files(whole)
+    assert [path.name for path in cut.rglob(".*")] == []
+
+
+def test_ctrl_c_ends_with_130_and_keeps_what_is_done(tmp_path, recordings):
+    process = started(tmp_path, recordings, tmp_path / "dataset", "--samples", "300")
+    while process.poll() is None and not contents_or_none(tmp_path):
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(0.01)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert (process.returncode, error.decode()) == (130, "cello3d: interrupted\n")
+    assert 1 <= len(contents(tmp_path)) < 10
+
+
+def contents_or_none(tmp_path):
+    folder = tmp_path / "dataset" / "pairs"
+    return folder.is_dir() and any(p.suffix == ".npz" for p in folder.iterdir())
+
+
+def test_adaptive_sampling_says_so_in_the_manifest_and_resumes(tmp_path, recordings, capsys):
+    flags = ["--samples", "adaptive", "--precision", "0.5"]
+    assert sample(tmp_path, recordings[:1], *flags) == 0
+    settings = json.loads((tmp_path / "dataset" / "manifest.json").read_text())["configuration"]
+    assert (settings["sampling"]["precision"], settings["sampling"]["n_samples"]) == (0.5, 20)
+    before = contents(tmp_path)
+    assert sample(tmp_path, recordings[:1], *flags) == 0
+    assert contents(tmp_path) == before
+    assert sample(tmp_path, recordings[:1]) == 1
+    assert "sampling.precision is 0.5, here 0.0" in capsys.readouterr().err
+
+
+def test_noise_is_a_setting_of_the_dataset(tmp_path, recordings, capsys):
+    assert sample(tmp_path, recordings[:1], "--noise", "0.02") == 0
+    assert sample(tmp_path, recordings[:1]) == 1
+    assert "sampling.noise_m is 0.02, here 0.0" in capsys.readouterr().err
+
+
+def test_another_registration_is_recorded_by_the_dataset_and_the_model(tmp_path, recordings):
+    pytest.importorskip("small_gicp")
+    from cello3d_ros.covariance.model import load_model
+
+    text = CONFIG.replace("icp: {", "icp: {backend: small_gicp, ")
+    (tmp_path / "config.yaml").write_text(text)
+    assert sample(tmp_path, recordings) == 0
+    model, config = str(tmp_path / "model.npz"), str(tmp_path / "config.yaml")
+    assert main(["train", str(tmp_path / "dataset"), "--out", model, "--config", config]) == 0
+    assert load_model(model).pipeline.icp.backend == "small_gicp"
+
+
+def test_samples_that_are_no_number_are_a_usage_error(tmp_path, recordings, capsys):
+    with pytest.raises(SystemExit) as error:
+        sample(tmp_path, recordings, "--samples", "many")
+    assert error.value.code == 2
+
+
+def test_two_recordings_of_one_name_are_refused(tmp_path, recordings, capsys):
+    other = write_kitti(tmp_path / "elsewhere" / "one", 7)
+    assert sample(tmp_path, [recordings[0], other]) == 1
+    assert "two recordings are named 'one'" in capsys.readouterr().err
+    assert not (tmp_path / "dataset").exists()
+
+
+def test_a_recording_that_ends_early_keeps_the_pairs_before(
+    tmp_path, recordings, capsys, monkeypatch
+):
+    from cello3d_ros.recordings.kitti import KittiRecording
+
+    monkeypatch.setattr(KittiRecording, "__len__", lambda self: 6)
+    assert sample(tmp_path, recordings[:1]) == 1
+    error = capsys.readouterr().err
+    assert "one: ends early, after 4 scans: scan 5 is missing" in error
+    assert error.count("\n") == 1
+    assert len(contents(tmp_path)) == 5
+
+
+def test_a_disk_without_room_is_one_sentence_and_the_rest_follows_later(
+    tmp_path, recordings, capsys
+):
+    """No file may grow past 4 kB: the manifest fits, pairs do not."""
+    assert sample(tmp_path, recordings[:1], "--samples", "90") == 0  # compiles
+    (tmp_path / "dataset").rename(tmp_path / "first")
+    capsys.readouterr()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4_000, hard))
+    try:
+        assert sample(tmp_path, recordings[:1], "--samples", "90") == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    error = capsys.readouterr().err
+    assert "cannot write" in error
+    assert "one_0_1.npz: File too large" in error
+    assert error.count("\n") == 1
+    assert contents(tmp_path) == {}
+    assert sample(tmp_path, recordings[:1], "--samples", "90") == 0
+    assert files(tmp_path / "dataset") == files(tmp_path / "first")
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path, recordings, capsys):
+    (tmp_path / "file").write_text("")
+    config = str(tmp_path / "config.yaml")
+    out = str(tmp_path / "file" / "dataset")
+    assert main(["sample", *recordings, "--out", out, "--config", config]) == 1
+    error = capsys.readouterr().err
+    assert "cannot write" in error
+    assert error.count("\n") == 1
+
+
+def test_the_bar_tells_registrations_a_second_and_the_time_left(tmp_path, recordings, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    assert sample(tmp_path, recordings[:1]) == 0
+    last = terminal.getvalue().rstrip().split("\r")[-1]
+    assert "100/100" in last
+    assert "reg/s" in last
+    assert "pair 5 of 5" in last
+    assert "<" in last

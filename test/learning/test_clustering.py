@@ -117,3 +117,40 @@ def test_offset_is_the_mean_over_all_samples() -> None:
     xi[::2, 3] += 1.0
     xi[1::2, 3] -= 1.0
     assert offset(xi) == pytest.approx((5.0, 0.5))
+
+
+def dbscan(xi: Array, scale_m: float, scale_rad: float, min_share: float) -> np.ndarray:
+    """Return the same with scikit-learn's DBSCAN, which holds all pairs of neighbours."""
+    from sklearn.cluster import DBSCAN
+
+    scaled = xi / np.repeat([scale_m, scale_rad], 3)
+    least = max(2, int(np.ceil(min_share * len(xi))))
+    found = DBSCAN(eps=1.0, min_samples=least).fit(scaled)
+    core = found.core_sample_indices_
+    if len(core) == 0:
+        return np.zeros(len(xi), bool)
+    nearest = core[np.argmin(np.linalg.norm(scaled[core], axis=1))]
+    return found.labels_ == found.labels_[nearest]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.004, 0.03])
+@pytest.mark.parametrize("spread", [0.02, 0.15, 0.4, 1.0])
+def test_the_cluster_is_that_of_scikit_learn(spread: float, share: float) -> None:
+    rng = np.random.default_rng(9)
+    centres = rng.normal(size=(6, 6)) * spread
+    xi = centres[rng.integers(6, size=900)] + rng.standard_t(3, (900, 6)) * NOISE
+    np.testing.assert_array_equal(
+        nearest_cluster(xi, 0.1, 0.05, share), dbscan(xi, 0.1, 0.05, share)
+    )
+
+
+def test_memory_is_linear_in_samples_that_are_all_neighbours() -> None:
+    import tracemalloc
+
+    nearest_cluster(noise(100), 0.1, 0.05, 0.002)  # compiles
+    xi = noise(20_000) * 0.1
+    tracemalloc.start()
+    assert nearest_cluster(xi, 0.1, 0.05, 0.002).all()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10 * xi.nbytes

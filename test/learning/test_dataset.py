@@ -265,3 +265,33 @@ def test_the_manifest_says_conventions_and_versions(dataset: Dataset) -> None:
     assert manifest["versions"]["numpy"] == np.__version__
     assert manifest["configuration"]["icp"]["trim_ratio"] == 0.7
     assert manifest["configuration"]["sampling"]["variance"] == 0.05
+
+
+def test_outcomes_tell_what_is_done_and_how_it_ended(dataset: Dataset) -> None:
+    dataset.write(accepted())
+    dataset.write(rejected())
+    dataset.write(accepted(i=2, j=3))
+    path = dataset.path / "pairs" / "hall_2_3.npz"
+    path.write_bytes(path.read_bytes()[:-9])
+    pairs = [(0, 1), (0, 2), (1, 3), (2, 3)]
+    for n_threads in (1, 3):
+        found = dataset.outcomes("hall", pairs, n_threads)
+        assert found == {(0, 1): "", (1, 3): "no_overlap"}
+    assert dataset.outcomes("other", pairs) == {}
+
+
+def test_the_number_of_registrations_is_recorded(dataset: Dataset) -> None:
+    dataset.write(accepted())
+    assert dataset.read("hall", 0, 1).n_samples == 31
+
+
+def test_a_manifest_from_before_precision_noise_and_backends_is_read(dataset: Dataset) -> None:
+    path = dataset.path / "manifest.json"
+    manifest = json.loads(path.read_text())
+    for name in ("precision", "min_samples", "noise_m"):
+        del manifest["configuration"]["sampling"][name]
+    for name in ("backend", "max_distance_m"):
+        del manifest["configuration"]["icp"][name]
+    path.write_text(json.dumps(manifest))
+    again = open_dataset(dataset.path, Pipeline(), SamplingConfig(), create=True)
+    assert (again.pipeline, again.sampling) == (Pipeline(), SamplingConfig())

@@ -1,12 +1,25 @@
+import dataclasses
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import CloudConfig, IcpConfig, OverlapConfig, Pipeline, SamplingConfig
-from cello3d_ros.errors import RecordingError
+from cello3d_ros.errors import CloudError, RecordingError
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import exp, inverse, log, transform
-from cello3d_ros.learning.sampling import sample_pair, sample_recording
+from cello3d_ros.learning.noise import noisy
+from cello3d_ros.learning.precision import eigenvalue_errors
+from cello3d_ros.learning.sampling import (
+    describe_pair,
+    finish_pair,
+    is_precise,
+    register_block,
+    sample_pair,
+    sample_recording,
+    stops,
+)
 from cello3d_ros.recordings.recording import Scan
 
 PIPELINE = Pipeline(
@@ -160,3 +173,185 @@ def test_sampling_without_ground_truth_is_an_error(room):
     blind = Recorded("blind", [Scan(stamp_ns=k, points=room[0]) for k in range(2)])
     with pytest.raises(RecordingError, match="no ground truth"):
         list(sample_recording(blind, [(0, 1)], PIPELINE, SAMPLING))
+
+
+def assert_same(a, b):
+    for field in dataclasses.fields(a):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, dict):
+            assert x.keys() == y.keys()
+            assert all(np.array_equal(x[name], y[name]) for name in x)
+        else:
+            np.testing.assert_array_equal(x, y)
+
+
+def with_samples(n, **settings):
+    return SamplingConfig(n_samples=n, variance=0.01, seed=5, n_rotations=2, **settings)
+
+
+def test_blocks_of_any_size_make_the_same_record(room):
+    reading, reference = cloud(room[0]), cloud(room[1])
+    sampling = with_samples(40)
+    whole = sample_pair("r", 0, 1, reading, reference, np.eye(4), PIPELINE, sampling)
+    pair = describe_pair("r", 0, 1, reading, reference, np.eye(4), PIPELINE, sampling)
+    for cuts in ([0, 7, 8, 40], [0, 39, 40]):
+        blocks = [
+            register_block(pair, reading, reference, PIPELINE, sampling, a, b)
+            for a, b in pairwise(cuts)
+        ]
+        assert_same(finish_pair(pair, blocks, sampling), whole)
+
+
+def test_adaptive_sampling_stops_early_and_is_the_shorter_run(room):
+    reading, reference = cloud(room[0]), cloud(room[1])
+
+    def run(sampling):
+        counts = []
+        record = sample_pair(
+            "r", 0, 1, reading, reference, np.eye(4), PIPELINE, sampling, 2, counts.append
+        )
+        assert sum(counts) == record.n_samples
+        return record
+
+    adaptive = run(with_samples(400, precision=0.25, min_samples=20))
+    assert adaptive.accepted
+    assert 20 < adaptive.n_samples < 400
+    assert (eigenvalue_errors(adaptive.xi[adaptive.kept]) <= 0.25).all()
+    assert_same(adaptive, run(with_samples(adaptive.n_samples)))
+    assert run(with_samples(30, precision=1e-6, min_samples=20)).n_samples == 30
+    assert run(with_samples(400, precision=1.0, min_samples=20)).n_samples == 20
+
+
+def test_a_rejected_pair_is_never_precise(room):
+    wrong = sample_pair(
+        "r", 0, 1, cloud(room[0]), cloud(room[1]), exp([0, 0, 0, 0, 0, 1.4]), PIPELINE,
+        with_samples(30, precision=1.0, min_samples=20, max_offset_m=0.1, max_offset_rad=0.1),
+    )  # fmt: skip
+    assert not wrong.accepted
+    assert not is_precise(wrong, 1.0)
+    assert wrong.n_samples in (0, 30)
+
+
+@pytest.mark.parametrize("precision", [0.0, 0.1])
+@pytest.mark.parametrize(("n", "least"), [(2, 200), (500, 200), (501, 7), (5000, 2)])
+def test_the_looks_at_a_pair_end_with_the_last_registration(n, least, precision):
+    looks = stops(with_samples(n, precision=precision, min_samples=least))
+    assert looks[-1] == n
+    assert all(a < b for a, b in pairwise(looks))
+    assert precision == 0.0 or looks[0] == min(least, n)
+
+
+def test_eigenvalue_errors_are_those_of_repeated_sampling():
+    """Against the scatter of the eigenvalues of many samples, and sqrt(2 / n) for Gaussians."""
+    rng = np.random.default_rng(3)
+    scale = np.array([1.0, 0.1, 3.0, 0.01, 0.3, 0.03])
+    n = 800
+    values = [
+        np.linalg.eigvalsh(sampled_covariance(rng.normal(size=(n, 6)) * scale)) for _ in range(400)
+    ]
+    scatter = np.std(values, axis=0) / np.mean(values, axis=0)
+    errors = eigenvalue_errors(rng.normal(size=(n, 6)) * scale)
+    np.testing.assert_allclose(errors, scatter, rtol=0.25)
+    np.testing.assert_allclose(errors, np.sqrt(2 / n), rtol=0.2)
+    heavy = rng.standard_t(4.5, size=(n, 6)) * scale
+    assert eigenvalue_errors(heavy).mean() > 1.3 * np.sqrt(2 / n)
+
+
+def test_noise_lies_along_the_rays_with_the_stated_deviation(room):
+    before = cloud(room[0])
+    kept = np.arange(0, len(before.points), 2)
+    after = noisy(before, kept, 0.05, np.random.default_rng(0))
+    order = np.array([np.argmin(np.linalg.norm(np.cross(before.points[kept], p), axis=1)
+                                + np.linalg.norm(before.points[kept] - p, axis=1))
+                      for p in after.points[:300]])  # fmt: skip
+    rays = before.points[kept][order]
+    ranges = np.linalg.norm(rays, axis=1)
+    moved = np.linalg.norm(after.points[:300], axis=1) - ranges
+    np.testing.assert_allclose(np.cross(rays, after.points[:300]) / ranges[:, None] ** 2, 0,
+                               atol=1e-12)  # fmt: skip
+    assert abs(moved.std() / 0.05 - 1) < 0.15
+    np.testing.assert_array_equal(after.normals[:300], before.normals[kept][order])
+    np.testing.assert_array_equal(after.points, after.tree.points)
+
+
+def test_noise_widens_the_covariance_and_none_changes_nothing(room):
+    reading, reference = cloud(room[0]), cloud(room[1])
+    traces = []
+    for sigma in (0.0, 1e-9, 0.05):
+        sampling = with_samples(60, noise_m=sigma)
+        one, two = (
+            sample_pair("r", 0, 1, reading, reference, np.eye(4), PIPELINE, sampling, n)
+            for n in (1, 2)
+        )
+        assert one.accepted
+        assert_same(one, two)
+        traces.append(np.trace(one.covariance))
+    assert traces[1] == pytest.approx(traces[0], rel=1e-3)
+    assert traces[2] > 1.5 * traces[0]
+
+
+def test_a_recording_that_ends_early_says_so_after_the_pairs_that_it_has():
+    short = recorded("r", 3)
+    records = sample_recording(short, [(0, 1), (1, 2), (2, 3)], PIPELINE, with_samples(15))
+    assert [next(records).key[1:] for _ in range(2)] == [(0, 1), (1, 2)]
+    with pytest.raises(RecordingError, match="r: ends early, after 3 scans: scan 3 is missing"):
+        next(records)
+
+
+def test_scans_after_the_last_pair_are_not_read():
+    class Guarded(Recorded):
+        def __iter__(self):
+            yield from self.scans[:2]
+            raise AssertionError("read on")
+
+    records = sample_recording(Guarded("r", recorded("r").scans), [(0, 1)], PIPELINE, SAMPLING)
+    assert len(list(records)) == 1
+
+
+def test_planes_are_singular_and_sampling_goes_on():
+    rng = np.random.default_rng(8)
+
+    def plane():
+        return rng.uniform(-5, 5, (4000, 3)) * [1, 1, 0] - [0, 0, 1.5]
+
+    scans = [Scan(stamp_ns=k, points=plane(), T_world_sensor=np.eye(4)) for k in range(2)]
+    scans += recorded("r", 4).scans[2:]
+    records = list(
+        sample_recording(
+            Recorded("r", scans), [(0, 1), (1, 2), (2, 3)], PIPELINE, with_samples(15)
+        )
+    )
+    assert [r.reason for r in records][::2] == ["singular", ""]
+    assert not records[1].accepted
+    for record in records:
+        assert np.isfinite(record.xi).all()
+
+
+def test_registrations_without_an_answer_are_counted_and_left_out(room, monkeypatch):
+    """Of four, one fails, one gives a pose that is not finite, one stops at its last step."""
+    reading, reference = cloud(room[0]), cloud(room[1])
+    sampling = with_samples(4)
+    pair = describe_pair("r", 0, 1, reading, reference, np.eye(4), PIPELINE, sampling)
+    answer = register_block(pair, reading, reference, PIPELINE, sampling, 0, 1)
+
+    def some(reading, reference, starts, seeds, config, n_threads):
+        from cello3d_ros.registration.icp import Registration
+
+        bad = np.full((4, 4), np.nan)
+        return [
+            Registration(exp(answer.xi[0]), 5, True, "", 0.01, 900),
+            Registration(np.eye(4), 0, False, "singular", np.nan, 0),
+            Registration(bad, 5, True, "", 0.01, 900),
+            Registration(np.eye(4), 80, False, "max_iterations", 0.01, 900),
+        ]
+
+    monkeypatch.setattr("cello3d_ros.learning.sampling.register_many", some)
+    block = register_block(pair, reading, reference, PIPELINE, sampling, 0, 4)
+    assert (len(block.xi), block.n_converged, block.n_failed) == (2, 1, 2)
+    np.testing.assert_allclose(block.xi, [answer.xi[0], np.zeros(6)], atol=1e-12)
+    assert finish_pair(pair, [block], sampling).reason == "singular"
+
+
+def test_clouds_with_fewer_points_than_neighbors_are_no_clouds():
+    with pytest.raises(CloudError, match="3 of 3 points are left"):
+        cloud(np.ones((3, 3)) * np.arange(1, 4)[:, None])

@@ -17,6 +17,7 @@ from cello3d_ros.recordings.bag import BagRecording, write_bag
 
 CLOUD, ODOMETRY = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry"
 POSE, TRANSFORM = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped"
+TF = "tf2_msgs/msg/TFMessage"
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND + 123_456_789
 FORMATS = ["bag", "sqlite3", "mcap"]
@@ -140,6 +141,13 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
                 same(scan, other)
 
 
+def test_a_folder_named_like_a_rosbag1_is_read(tmp_path: Path) -> None:
+    scans = make_scans()
+    write_bag(tmp_path / "drive.bag", scans)
+    for scan, other in zip(open_recording(tmp_path / "drive.bag"), scans, strict=True):
+        same(scan, other)
+
+
 def test_scans_without_poses_are_read_back_without(tmp_path: Path) -> None:
     bare = [Scan(stamp_ns=s.stamp_ns, points=s.points) for s in make_scans(3)]
     write_bag(tmp_path / "bare", bare)
@@ -168,10 +176,13 @@ def test_a_written_bag_says_what_players_need(tmp_path: Path) -> None:
     with Reader(tmp_path / "one") as reader:
         assert {c.topic: c.msgtype for c in reader.connections} == {
             "/points": CLOUD, "/odom": ODOMETRY, "/ground_truth": ODOMETRY,
+            "/tf": TF, "/tf_static": TF,
         }  # fmt: skip
         for connection in reader.connections:
             (qos,) = connection.ext.offered_qos_profiles
-            assert (qos.reliability.name, qos.durability.name) == ("RELIABLE", "VOLATILE")
+            assert qos.reliability.name == "RELIABLE"
+            late = connection.topic == "/tf_static"  # who comes late must hear it too
+            assert qos.durability.name == ("TRANSIENT_LOCAL" if late else "VOLATILE")
             assert connection.ext.serialization_format == "cdr"
         first = {}
         for connection, _, raw in reader.messages():
@@ -364,13 +375,22 @@ def test_broken_metadata_is_an_error(tmp_path: Path) -> None:
 
 
 def test_a_bag_with_fewer_clouds_than_it_declares_is_an_error(tmp_path: Path) -> None:
-    write_bag(tmp_path / "one", make_scans(3))
+    bare = [Scan(stamp_ns=s.stamp_ns, points=s.points) for s in make_scans(3)]
+    write_bag(tmp_path / "one", bare)
     metadata = tmp_path / "one" / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace("message_count: 3\n", "message_count: 4\n"))
     scans = iter(open_recording(tmp_path / "one"))
     assert [next(scans).stamp_ns for _ in range(3)]
     with pytest.raises(RecordingError, match="one: ends early, after 3 of 4 clouds"):
         next(scans)
+
+
+def test_a_bag_with_fewer_poses_than_it_declares_is_an_error(tmp_path: Path) -> None:
+    write_bag(tmp_path / "one", make_scans(3))
+    metadata = tmp_path / "one" / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("message_count: 21\n", "message_count: 22\n"))
+    with pytest.raises(RecordingError, match="one: /odom: ends early, after 21 of 22 poses"):
+        list(open_recording(tmp_path / "one"))
 
 
 def test_an_existing_target_is_refused_and_left_alone(tmp_path: Path) -> None:

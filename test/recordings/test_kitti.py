@@ -130,7 +130,7 @@ def test_fewer_poses_than_scans_are_refused(tmp_path: Path) -> None:
         ("poses.txt", "a b c\n", r"poses\.txt: cannot be read"),
         ("poses.txt", "", "has 0 rows"),
         ("times.txt", "0\n1\n1\n", r"times\.txt: row 3 does not follow in time"),
-        ("times.txt", "0\nnan\n1\n", "row 2 does not follow"),
+        ("times.txt", "0\nnan\n1\n", "row 2: 'nan' is not a time"),
         ("times.txt", "0\n1\n", "has 2 rows"),
         ("calib.txt", "Tr: 1 0 0\n", "Tr is not a rotation"),
         ("calib.txt", "Tr: 2 0 0 0 0 1 0 0 0 0 1 0\n", "Tr is not a rotation"),

@@ -170,6 +170,17 @@ def test_each_of_many_registrations_depends_on_its_own_seed_only(room):
     assert not np.array_equal(other.T_ref_read, alone.T_ref_read)
 
 
+def test_whole_clouds_put_in_order_once_give_the_same_bits(room):
+    rng = np.random.default_rng(16)
+    reading, reference = (prepare(scan, CloudConfig(), rng) for scan in room)
+    config = IcpConfig(n_reading_points=10**6, n_reference_points=10**6)
+    starts = exp(rng.normal(scale=0.1, size=(3, 6)))
+    many = register_many(reading, reference, starts, [[i] for i in range(3)], config, n_threads=2)
+    for T_init, found in zip(starts, many):
+        alone = register(reading, reference, T_init, config, np.random.default_rng(0))
+        np.testing.assert_array_equal(found.T_ref_read, alone.T_ref_read)
+
+
 @pytest.mark.parametrize(
     "case", ["indoor_10000_2000", "indoor_20000_5000", "street_10000_2000", "street_20000_5000"]
 )

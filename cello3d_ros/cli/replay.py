@@ -1,0 +1,148 @@
+"""``cello3d replay RECORDING --out DIR``: the estimator over a recording, without ROS."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cello3d_ros.cli.sources import add_source_arguments, open_source, with_progress
+from cello3d_ros.errors import RecordingError
+
+if TYPE_CHECKING:
+    from cello3d_ros.config import NodeConfig
+    from cello3d_ros.geometry.se3 import Array
+    from cello3d_ros.ros.offline import Step
+    from cello3d_ros.ros.tracker import Answer
+
+_PREFIX = "/covariance_node"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the verb."""
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="bag or data set")
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to make")
+    parser.add_argument("--model", metavar="M", type=Path, help="model file (the shipped one)")
+    parser.add_argument(
+        "--config", metavar="FILE", type=Path, help="YAML settings, of which 'node' counts"
+    )
+    add_source_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Leave poses.tum, covariances.jsonl and the node's messages in bag/.
+
+    Raises Cello3dError; RecordingError when no pair was answered.
+    """
+    from cello3d_ros.config import PIPELINE, Config, load_config
+    from cello3d_ros.covariance.model import load_model, shipped_model_path
+    from cello3d_ros.ros.offline import replay
+    from cello3d_ros.ros.tracker import Tracker
+
+    recording = open_source(arguments.recording, arguments)
+    model = load_model(arguments.model or shipped_model_path())
+    node = load_config(arguments.config).node if arguments.config else Config().node
+    config = Config(**{name: getattr(model.pipeline, name) for name in PIPELINE}, node=node)
+    tracker = Tracker(model, config, node)
+    steps = replay(recording, tracker, node)
+    counts = write_answers(
+        arguments.out, with_progress(steps, len(recording), recording.name), node
+    )
+    n_pairs = max(0, len(recording) - 1)
+    summary = {
+        "out": str(arguments.out),
+        "n_pairs": n_pairs,
+        "n_answered": counts.pop("", 0),
+        "n_restarts": tracker.n_restarts,
+        "failures": {k: n for k, n in counts.items() if k != "reference"},
+    }
+    print(json.dumps(summary) if arguments.json else _sentence(summary))
+
+
+def write_answers(out: Path, steps: Any, config: NodeConfig) -> Counter[str]:
+    """Write the three files as the steps come; return how many clouds met which fate."""
+    from cello3d_ros.recordings.bag_writer import write_messages
+    from cello3d_ros.recordings.staging import new_folder
+
+    counts: Counter[str] = Counter()
+    with new_folder(out) as folder, ExitStack() as stack:
+        folder.mkdir()
+        poses = stack.enter_context((folder / "poses.tum").open("w"))
+        lines = stack.enter_context((folder / "covariances.jsonl").open("w"))
+        messages = _recorded(steps, poses, lines, config, counts)
+        write_messages(folder / "bag", messages, {"made_by": "cello3d replay"})
+        if not counts[""]:
+            raise RecordingError(f"no pair was answered: {dict(counts)}")
+    return counts
+
+
+def _recorded(
+    steps: Iterator[Step], poses: Any, lines: Any, config: NodeConfig, counts: Counter[str]
+) -> Iterator[tuple[str, int, Any]]:
+    """Write each step to the two text files and yield its messages."""
+    from rosbags.typesys import Stores, get_typestore
+
+    from cello3d_ros.recordings.bag_messages import Messages
+    from cello3d_ros.recordings.poses import tum_line
+
+    make = Messages(get_typestore(Stores.ROS2_JAZZY))
+    for step in steps:
+        counts[step.reason] += 1
+        stamp_ns = step.scan.stamp_ns
+        if (answer := step.answer) is None:
+            failure = {"stamp_ns": stamp_ns, "reason": step.reason, "sentence": step.sentence}
+            lines.write(json.dumps(failure) + "\n")
+            continue
+        T_ref_read = answer.estimate.registration.T_ref_read
+        C = _published(answer.estimate.covariance, T_ref_read, config)
+        C_chain = _published(answer.Y_chain, answer.T_odom_read, config)
+        poses.write(tum_line(stamp_ns, answer.T_odom_read))
+        lines.write(json.dumps(_as_dict(answer, C, C_chain)) + "\n")
+        yield (
+            f"{_PREFIX}/relative_pose",
+            stamp_ns,
+            make.pose_with_covariance(T_ref_read, C, stamp_ns, "lidar"),
+        )
+        yield (
+            f"{_PREFIX}/pose",
+            stamp_ns,
+            make.pose_with_covariance(answer.T_odom_read, C_chain, stamp_ns, "odom"),
+        )
+
+
+def _published(Y: Array, T: Array, config: NodeConfig) -> Array:
+    from cello3d_ros.ros.covariances import ros_covariance
+
+    return ros_covariance(
+        Y, T[:3, :3], config.floor_sigma_m, config.floor_sigma_rad, config.ceiling
+    )
+
+
+def _as_dict(answer: Answer, C: Array, C_chain: Array) -> dict[str, Any]:
+    """Return an answer as plain numbers; matrices row by row, covariances as ROS has them."""
+    estimate = answer.estimate
+    return {
+        "stamp_ns": answer.stamp_ns,
+        "reference_ns": answer.reference_ns,
+        "T_ref_read": estimate.registration.T_ref_read.ravel().tolist(),
+        "covariance": C.ravel().tolist(),
+        "T_odom_read": answer.T_odom_read.ravel().tolist(),
+        "covariance_chain": C_chain.ravel().tolist(),
+        "iterations": estimate.registration.n_iterations,
+        "residual_rms_m": estimate.registration.residual_rms_m,
+        "overlap_ratio": estimate.overlap_ratio,
+        "nearest_rho": estimate.nearest_rho,
+        "effective_neighbors": estimate.effective_neighbors,
+    }
+
+
+def _sentence(summary: dict[str, Any]) -> str:
+    text = f"{summary['out']}: {summary['n_answered']} of {summary['n_pairs']} pairs answered"
+    for reason, n in summary["failures"].items():
+        text += f"; {n} {reason.replace('_', ' ')}"
+    return text

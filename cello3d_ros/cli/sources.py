@@ -1,0 +1,72 @@
+"""What verbs that read a recording share: arguments, opening, progress."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cello3d_ros.errors import RecordingError
+
+if TYPE_CHECKING:
+    from cello3d_ros.recordings import Recording
+
+
+def add_source_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options that say how a recording is read."""
+    parser.add_argument("--points", metavar="TOPIC", help="clouds of a bag")
+    parser.add_argument("--odometry", metavar="TOPIC", help="odometry of a bag, '' for none")
+    parser.add_argument("--ground-truth", metavar="TOPIC", help="ground truth, '' for none")
+    parser.add_argument(
+        "--ground-truth-frames", nargs=2, metavar=("WORLD", "FRAME"), help="ground truth from TF"
+    )
+    parser.add_argument(
+        "--extrinsic",
+        nargs=7,
+        type=float,
+        metavar=("X", "Y", "Z", "QX", "QY", "QZ", "QW"),
+        help="pose of the sensor in the frame whose poses a bag has",
+    )
+    parser.add_argument(
+        "--poses", type=Path, metavar="FILE", help="TUM or KITTI poses of a folder of clouds"
+    )
+
+
+def open_source(path: Path, arguments: argparse.Namespace) -> Recording:
+    """Return the recording.  Raises RecordingError."""
+    import numpy as np
+
+    from cello3d_ros.geometry import se3
+    from cello3d_ros.recordings import open_recording
+
+    T_base_sensor = None
+    if (given := arguments.extrinsic) is not None:
+        if not np.isfinite(given).all() or abs(np.linalg.norm(given[3:]) - 1.0) > 1e-3:
+            raise RecordingError("--extrinsic needs x y z and a unit quaternion qx qy qz qw")
+        T_base_sensor = se3.pose(given[:3], given[3:])
+    frames = arguments.ground_truth_frames
+    return open_recording(
+        path,
+        arguments.points,
+        arguments.odometry,
+        arguments.ground_truth,
+        ground_truth_frames=None if frames is None else (frames[0], frames[1]),
+        T_base_sensor=T_base_sensor,
+        poses=arguments.poses,
+    )
+
+
+def with_progress(scans: Iterable[Any], total: int, name: str) -> Any:
+    """Return the scans, with a bar of counts and time left where there is a terminal."""
+    from tqdm import tqdm
+
+    return tqdm(
+        scans,
+        total=total,
+        desc=name,
+        unit="scan",
+        disable=not sys.stderr.isatty(),
+        leave=False,
+    )

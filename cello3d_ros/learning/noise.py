@@ -1,0 +1,67 @@
+"""Monte Carlo with sensor noise: every registration sees other ranges.
+
+Source: the sampled covariances of Bengtsson & Baerveldt 2003 and Iversen et al. 2017.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cello3d_ros.clouds.filters import subsample
+from cello3d_ros.clouds.neighbors import build_tree
+from cello3d_ros.clouds.shape import Cloud
+from cello3d_ros.config import IcpConfig
+from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.registration.backends import in_threads, register
+from cello3d_ros.registration.icp import Registration
+
+
+def register_many_noisy(
+    reading: Cloud,
+    reference: Cloud,
+    T_inits: Array,
+    seeds: Sequence[Sequence[int]],
+    config: IcpConfig,
+    sigma_m: float,
+    n_threads: int = 1,
+) -> list[Registration]:
+    """Register from many starts, each with subsamples and range noise of its own.
+
+    T_inits: (n, 4, 4); seeds: n seeds of numpy's default generator.  The subsamples are those
+    that the same seeds draw without noise; sigma_m is the standard deviation of the noise.
+    """
+
+    def one(k: int) -> Registration:
+        rng = np.random.default_rng(seeds[k])
+        read = subsample(len(reading.points), config.n_reading_points, rng)
+        ref = subsample(len(reference.points), config.n_reference_points, rng)
+        P, Q = noisy(reading, read, sigma_m, rng), noisy(reference, ref, sigma_m, rng)
+        return register(P, Q, T_inits[k], config, rng)
+
+    return in_threads(one, len(T_inits), n_threads)
+
+
+def noisy(
+    cloud: Cloud, kept: NDArray[np.int64], sigma_m: float, rng: np.random.Generator
+) -> Cloud:
+    """Return some points of a cloud, each moved along its ray by N(0, sigma_m^2).
+
+    The points keep the normals and features of the recorded cloud.  Those hold one draw of the
+    sensor's noise already, averaged over their neighbourhood; computing them anew from the noisy
+    cloud would add the same noise twice and cost more than the registration.
+    """
+    points = cloud.points[kept]
+    ranges = np.linalg.norm(points, axis=1, keepdims=True)
+    rays = points / np.maximum(ranges, np.finfo(np.float64).tiny)
+    tree = build_tree(points + sigma_m * rng.normal(size=ranges.shape) * rays)
+    order = kept[tree.order]
+    return cloud._replace(
+        points=tree.points,
+        normals=cloud.normals[order],
+        planarity=cloud.planarity[order],
+        cylindricality=cloud.cylindricality[order],
+        tree=tree._replace(order=np.arange(len(kept))),
+    )

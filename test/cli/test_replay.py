@@ -1,0 +1,154 @@
+"""``cello3d replay`` gives the node's numbers, without ROS."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from cello3d_ros.cli.main import main
+from cello3d_ros.covariance.model import constant_model, save_model
+from cello3d_ros.geometry.se3 import exp, inverse, transform
+from cello3d_ros.recordings import Scan
+from cello3d_ros.recordings.bag import write_bag
+from cello3d_ros.recordings.poses import read_tum
+from cello3d_ros.ros.warmup import room
+
+N = 6
+TOPICS = ("/covariance_node/relative_pose", "/covariance_node/pose")
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Path:
+    """A model whose prediction is relative to the pair's own shape, so that it differs."""
+    path = tmp_path_factory.mktemp("model") / "relative.npz"
+    save_model(constant_model(np.eye(6), 704, shape="sandwich"), path)
+    return path
+
+
+def walk(path: Path, holes: tuple[int, ...] = (), odometry: bool = True) -> Path:
+    rng = np.random.default_rng(2)
+    poses = [exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.1]) * i) for i in range(N)]
+    drift = np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.002])
+    scans = [
+        Scan(
+            stamp_ns=10**18 + i * 500_000_000,
+            points=np.empty((0, 3)) if i in holes else transform(inverse(T), room(rng)),
+            T_world_sensor=T,
+            T_odom_sensor=T @ exp(drift * i) if odometry else None,
+        )
+        for i, T in enumerate(poses)
+    ]
+    write_bag(path, scans)
+    return path
+
+
+def answers(bag: Path) -> dict[str, list[np.ndarray]]:
+    """Return stamp, pose and covariance of each message in one row, by topic."""
+    rows: dict[str, list[np.ndarray]] = {topic: [] for topic in TOPICS}
+    with AnyReader([bag]) as reader:
+        for connection, _, raw in reader.messages():
+            if connection.topic in TOPICS:
+                m = reader.deserialize(raw, connection.msgtype)
+                p, q, stamp = m.pose.pose.position, m.pose.pose.orientation, m.header.stamp
+                pose = [stamp.sec, stamp.nanosec, p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+                rows[connection.topic].append(np.concatenate([pose, m.pose.covariance]))
+    return rows
+
+
+def test_the_numbers_are_those_of_the_node_on_the_same_bag(tmp_path: Path, model: Path) -> None:
+    pytest.importorskip("rclpy")
+    bag = walk(tmp_path / "walk")
+    run = "from cello3d_ros.cli.main import main\nraise SystemExit(main())"
+    words = ["demo", "--recording", bag, "--out", tmp_path / "node", "--model", model]
+    done = subprocess.run(
+        [sys.executable, "-c", run, *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env={**os.environ, "ROS_PYTHON_CHECK_FIELDS": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert main(["replay", str(bag), "--out", str(tmp_path / "r"), "--model", str(model)]) == 0
+    node, ours = answers(tmp_path / "node" / "bag"), answers(tmp_path / "r" / "bag")
+    for topic in TOPICS:
+        assert len(node[topic]) == len(ours[topic]) == N - 1
+        assert np.abs(np.array(node[topic]) - np.array(ours[topic])).max() < 1e-9
+    covariances = np.array(ours[TOPICS[0]])[:, 9:]
+    assert np.ptp(covariances, axis=0).max() > 1e-9  # the comparison is not of constants
+
+
+def test_three_files_say_the_same(tmp_path: Path, model: Path, capsys) -> None:
+    bag = walk(tmp_path / "walk")
+    out = tmp_path / "r"
+    assert main(["replay", str(bag), "--out", str(out), "--model", str(model)]) == 0
+    assert "5 of 5 pairs answered" in capsys.readouterr().out
+    lines = [json.loads(line) for line in (out / "covariances.jsonl").read_text().splitlines()]
+    assert lines[0] == {"stamp_ns": 10**18, "reason": "reference", "sentence": ""}
+    tum = read_tum((out / "poses.tum").read_bytes(), "poses")
+    rows = answers(out / "bag")
+    assert [line["stamp_ns"] for line in lines[1:]] == tum.stamps_ns
+    for k, line in enumerate(lines[1:]):
+        assert np.array_equal(line["covariance"], rows[TOPICS[0]][k][9:])
+        assert np.array_equal(line["covariance_chain"], rows[TOPICS[1]][k][9:])
+        assert np.array_equal(tum.rows[k], rows[TOPICS[1]][k][2:9])
+        assert np.allclose(np.reshape(line["T_odom_read"], (4, 4))[:3, 3], tum.rows[k, :3])
+
+
+def test_failures_are_counted_and_named(tmp_path: Path, model: Path, capsys) -> None:
+    bag = walk(tmp_path / "walk", holes=(2,))
+    out = tmp_path / "r"
+    assert main(["replay", str(bag), "--out", str(out), "--model", str(model), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["n_answered"], summary["n_pairs"]) == (4, 5)
+    assert summary["failures"] == {"too_few_points": 1}
+    lines = [json.loads(line) for line in (out / "covariances.jsonl").read_text().splitlines()]
+    assert lines[2]["reason"] == "too_few_points"
+
+
+def test_without_odometry_ground_truth_is_made_to_drift(tmp_path: Path, model: Path) -> None:
+    bag = walk(tmp_path / "walk", odometry=False)
+    out = tmp_path / "r"
+    assert main(["replay", str(bag), "--out", str(out), "--model", str(model)]) == 0
+    assert len(answers(out / "bag")[TOPICS[0]]) == N - 1
+
+
+def test_the_sensor_is_where_the_node_s_parameter_says(tmp_path: Path, model: Path) -> None:
+    bag = walk(tmp_path / "walk")
+    quarter = [0.1, 0.2, 0.3, 0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5))]
+    (tmp_path / "c.yaml").write_text(f"node: {{T_base_sensor: {quarter}}}\n")
+    words = ["replay", str(bag), "--model", str(model)]
+    assert main([*words, "--out", str(tmp_path / "b"), "--config", str(tmp_path / "c.yaml")]) == 0
+    lines = (tmp_path / "b" / "covariances.jsonl").read_text().splitlines()
+    first = next(answer for line in lines if "T_odom_read" in (answer := json.loads(line)))
+    T = np.reshape(first["T_odom_read"], (4, 4)) @ inverse(np.reshape(first["T_ref_read"], (4, 4)))
+    start = np.reshape([0, -1, 0, 0.1, 1, 0, 0, 0.2, 0, 0, 1, 0.3, 0, 0, 0, 1], (4, 4))
+    assert first["reference_ns"] == 10**18  # where the odometry is the identity
+    assert np.allclose(T, start, atol=1e-9)
+
+
+def test_no_answer_at_all_is_an_error_and_leaves_nothing(tmp_path, model, capsys) -> None:
+    bag = walk(tmp_path / "walk", holes=tuple(range(N)))
+    assert main(["replay", str(bag), "--out", str(tmp_path / "r"), "--model", str(model)]) == 1
+    assert "no pair was answered" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["walk"]
+
+
+def test_it_runs_where_ros_cannot_be_imported(tmp_path: Path, model: Path) -> None:
+    bag = walk(tmp_path / "walk")
+    code = (
+        "import sys\n"
+        "for name in ('rclpy', 'sensor_msgs', 'geometry_msgs', 'nav_msgs', 'open3d'):\n"
+        "    sys.modules[name] = None\n"
+        "from cello3d_ros.cli.main import main\nraise SystemExit(main())"
+    )
+    words = ["replay", str(bag), "--out", str(tmp_path / "r"), "--model", str(model)]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
