@@ -10,7 +10,7 @@ from cello3d_ros.covariance.closed_form import closed_form, common_bias
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import symmetrized
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log
-from cello3d_ros.registration.icp import register_many
+from cello3d_ros.registration.backends import register_many
 from cello3d_ros.registration.overlap import find_overlap
 
 

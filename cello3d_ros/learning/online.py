@@ -16,7 +16,7 @@ from cello3d_ros.errors import CloudError, ModelError, RecordingError, Registrat
 from cello3d_ros.geometry.gaussian import is_positive_definite
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.recordings.recording import Recording
-from cello3d_ros.registration.icp import register
+from cello3d_ros.registration.backends import register
 
 
 class Answer(NamedTuple):
