@@ -18,6 +18,7 @@ VERBS = {
     "simulate": "scan a simulated world into a rosbag2",
     "sample": "sample ICP on every pair of recordings into a dataset",
     "train": "learn a model from datasets",
+    "evaluate": "judge covariances beside every baseline",
     "replay": "run the estimator over a recording, without ROS",
     "demo": "replay a bag through the node and judge its answers",
 }

@@ -6,12 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from cello3d_ros.clouds.neighbors import Indices
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.errors import RegistrationError
-from cello3d_ros.geometry.se3 import Array, transform
+from cello3d_ros.geometry.gaussian import symmetrized
+from cello3d_ros.geometry.se3 import Array, hat, transform
 
 
 class ClosedForm(NamedTuple):
@@ -41,8 +43,6 @@ def closed_form(
     n_reading_points of the reading's N points, so both are scaled by N / n_reading_points.
     Raises RegistrationError when the geometry leaves a direction free.
     """
-    rank = min(int(distances2.size * config.trim_ratio), distances2.size - 1)
-    limit = np.partition(distances2, rank, axis=None)[rank]
     H, G = _normal_matrices(
         reading.points,
         transform(T_ref_read, reading.points),
@@ -51,19 +51,115 @@ def closed_form(
         np.ascontiguousarray(T_ref_read[:3, :3]),
         distances2,
         indices,
-        limit,
+        _trim_limit(distances2, config),
     )
+    inverse_H = _inverse(H)
+    drawn = _drawn(reading, config)
+    return ClosedForm(drawn * inverse_H, symmetrized(drawn * inverse_H @ G @ inverse_H))
+
+
+def censi(
+    reading: Cloud,
+    reference: Cloud,
+    T_ref_read: Array,
+    distances2: Array,
+    indices: Indices,
+    config: IcpConfig,
+    sigma_m: float,
+) -> Array:
+    """Return what sensor noise does to the minimum of ICP's objective J.  (6, 6), reading side.
+
+    ``Y = J_xx^-1 J_xz cov(z) J_xz^T J_xx^-1``, the implicit function's derivative, z being the
+    points of both clouds with noise of deviation sigma_m along every axis, x = xi of
+    ``T exp(xi)``; normals and associations stay.  Scaled and refused like ``closed_form``.
+    Source: Prakhya et al. 2015, after Censi 2007, for the point-to-plane error.
+    """
+    kept = distances2 <= _trim_limit(distances2, config)
+    J_xx, spread = _implicit_derivative(reading, reference, T_ref_read, indices, kept)
+    inverse = _inverse(J_xx)
+    return symmetrized(_drawn(reading, config) * sigma_m**2 * inverse @ spread @ inverse)
+
+
+def common_bias(
+    reading: Cloud,
+    reference: Cloud,
+    T_ref_read: Array,
+    distances2: Array,
+    indices: Indices,
+    config: IcpConfig,
+) -> Array:
+    """Return ``b = H^-1 sum J``: how far a bias of 1 m of all ranges moves ICP.  (6,), xi.
+
+    The bias is along the normals, turned towards the reference's sensor.
+    Source: Brossard et al. 2020, the correlated part of the sensor noise.
+    """
+    kept = distances2 <= _trim_limit(distances2, config)
+    J, _ = _jacobians(reading, reference, T_ref_read, indices)
+    towards = np.einsum("mi,mi->m", reference.normals, reference.points) < 0.0
+    signs = np.where(towards, 1.0, -1.0)[indices] * kept
+    H = np.einsum("nku,nkv->uv", J * kept[..., None], J, optimize=True)
+    return np.asarray(_inverse(H) @ np.einsum("nku,nk->u", J, signs))
+
+
+def _jacobians(
+    reading: Cloud, reference: Cloud, T_ref_read: Array, indices: Indices
+) -> tuple[Array, Array]:
+    """Return ``J = [m, p x m]``, (N, k, 6), and ``m = R^T n``, (N, k, 3), of all associations."""
+    m = reference.normals[indices] @ T_ref_read[:3, :3]
+    return np.concatenate([m, np.cross(reading.points[:, None], m)], axis=2), m
+
+
+def _implicit_derivative(
+    reading: Cloud,
+    reference: Cloud,
+    T_ref_read: Array,
+    indices: Indices,
+    kept: NDArray[np.bool_],
+) -> tuple[Array, Array]:
+    """Return J_xx and ``J_xz J_xz^T`` of ``J = 1/2 sum r^2``, r = n . (T exp(xi) p - q).
+
+    With ``exp(xi) p = p + u + w x p + (w x u + w x (w x p)) / 2 + ...`` the second derivative of r
+    is ``[[0, hat(m)/2], [-hat(m)/2, (m p^T + p m^T)/2 - (m . p) I]]``.
+    """
+    p = reading.points
+    J, m = _jacobians(reading, reference, T_ref_read, indices)
+    moved = transform(T_ref_read, p)[:, None] - reference.points[indices]
+    r = np.einsum("nki,nki->nk", moved, reference.normals[indices]) * kept
+    J = J * kept[..., None]
+    rm = np.einsum("nk,nki->ni", r, m)
+    mixed = rm.T @ p
+    J_xx = np.einsum("nku,nkv->uv", J, J, optimize=True)
+    J_xx[:3, 3:] += 0.5 * hat(rm.sum(axis=0))
+    J_xx[3:, :3] -= 0.5 * hat(rm.sum(axis=0))
+    J_xx[3:, 3:] += 0.5 * (mixed + mixed.T) - np.trace(mixed) * np.eye(3)
+    by_reading = np.einsum("nku,nkv->nuv", J, m)  # d(J r)/dp
+    by_reading[:, 3:] -= hat(rm)
+    flat = by_reading.transpose(1, 0, 2).reshape(6, -1)
+    by_reference = np.zeros((len(reference.points), 6))  # times -n^T, a unit vector
+    np.add.at(by_reference, indices.ravel(), J.reshape(-1, 6))
+    return symmetrized(J_xx), flat @ flat.T + by_reference.T @ by_reference
+
+
+def _trim_limit(distances2: Array, config: IcpConfig) -> float:
+    """Return the squared distance up to which ICP keeps associations."""
+    rank = min(int(distances2.size * config.trim_ratio), distances2.size - 1)
+    return float(np.partition(distances2, rank, axis=None)[rank])
+
+
+def _drawn(reading: Cloud, config: IcpConfig) -> float:
+    """Return how many times fewer points of the reading ICP draws than there are."""
+    return len(reading.points) / min(len(reading.points), config.n_reading_points)
+
+
+def _inverse(H: Array) -> Array:
+    """Return ``H^-1``.  Raises RegistrationError if it is singular, whatever the units."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(H * np.outer(scale, scale))
     if not eigenvalues[0] > 1e-10 * eigenvalues[-1]:
         raise RegistrationError(
             "the overlap leaves a direction free: the normal equations of ICP are singular"
         )
-    inverse_H = np.outer(scale, scale) * ((vectors / eigenvalues) @ vectors.T)
-    n = len(reading.points)
-    drawn = n / min(n, config.n_reading_points)
-    sandwich = drawn * inverse_H @ G @ inverse_H
-    return ClosedForm(drawn * inverse_H, 0.5 * (sandwich + sandwich.T))
+    return np.asarray(np.outer(scale, scale) * ((vectors / eigenvalues) @ vectors.T))
 
 
 @njit(cache=True, nogil=True)

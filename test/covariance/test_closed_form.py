@@ -1,10 +1,16 @@
 import numpy as np
 import pytest
 
-from cello3d_ros.clouds.neighbors import nearest
-from cello3d_ros.clouds.shape import prepare
+from cello3d_ros.clouds.neighbors import build_tree, nearest
+from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import CloudConfig, IcpConfig
-from cello3d_ros.covariance.closed_form import _normal_matrices, closed_form
+from cello3d_ros.covariance.closed_form import (
+    _implicit_derivative,
+    _normal_matrices,
+    censi,
+    closed_form,
+    common_bias,
+)
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.se3 import exp, inverse, log, transform
 from cello3d_ros.registration.icp import icp
@@ -159,3 +165,116 @@ def test_a_free_direction_is_an_error():
     ground = prepare(plane(rng, 2, -1.0, 3000)[0], CloudConfig(), rng)
     with pytest.raises(RegistrationError, match="leaves a direction free"):
         predictors(ground, ground, np.eye(4), IcpConfig())
+
+
+def corners(n=12):
+    """Return points and normals of three walls with noise of 5 cm, and associations with it."""
+    rng = np.random.default_rng(36)
+    Q, normals = join(*(plane(rng, axis, 2.0, n) for axis in range(3)))
+    tilt = normals + rng.normal(scale=0.2, size=normals.shape)
+    normals = tilt / np.linalg.norm(tilt, axis=1, keepdims=True)
+    T = exp([0.4, -0.3, 0.05, 0.02, 0.05, 0.6])
+    indices = np.stack([np.arange(3 * n), rng.permutation(3 * n)], axis=1)  # of two neighbours
+    P = transform(inverse(T), Q) + rng.normal(scale=0.05, size=Q.shape)
+    distances2 = np.tile([0.0, 1.0], (3 * n, 1))
+    distances2[::3] = [0.0, 0.0]  # a third keep both, so that points share associations
+    return P, Q, normals, indices, distances2, T
+
+
+def minimum(P, Q, normals, kept, start):
+    """Return xi of the least point-to-plane error with fixed associations, by Gauss-Newton."""
+    i, q = kept
+    T = start
+    for _ in range(40):
+        m = normals[q] @ T[:3, :3]
+        J = np.hstack([m, np.cross(P[i], m)])
+        r = np.einsum("ij,ij->i", transform(T, P)[i] - Q[q], normals[q])
+        step = np.linalg.solve(J.T @ J, J.T @ r)
+        T = T @ exp(-step)
+        if np.abs(step).max() < 1e-14:
+            break
+    assert np.abs(step).max() < 1e-12
+    return log(inverse(start) @ T)
+
+
+def cloud(points, normals):
+    zeros = np.zeros(len(points))
+    tree = build_tree(points)
+    return Cloud(points, normals, zeros, zeros, tree)
+
+
+def test_censi_is_the_derivative_of_the_minimum_by_every_coordinate():
+    """Each coordinate of both clouds is moved, and the minimum found again."""
+    P, Q, normals, indices, distances2, T = corners()
+    near = distances2 == 0.0
+    kept = np.nonzero(near)[0], indices[near]
+    T = T @ exp(minimum(P, Q, normals, kept, T))
+    step, D = 1e-4, []
+    for points in (P, Q):
+        for index in np.ndindex(points.shape):
+            ends = []
+            for sign in (1, -1):
+                points[index] += sign * step
+                ends.append(minimum(P, Q, normals, kept, T))
+                points[index] -= sign * step
+            D.append((ends[0] - ends[1]) / (2 * step))
+    expected = 0.02**2 * np.array(D).T @ np.array(D)
+    share = near.sum() / near.size
+    config = IcpConfig(n_neighbors=2, trim_ratio=float(share) - 1e-9, n_reading_points=18)
+    found = censi(cloud(P, normals), cloud(Q, normals), T, distances2, indices, config, 0.02)
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        found / np.outer(scale, scale), 2.0 * expected / np.outer(scale, scale), atol=1e-6
+    )  # 18 of 36 points are drawn: twice the covariance
+
+
+def test_the_second_derivative_holds_away_from_the_minimum_too():
+    P, Q, normals, indices, distances2, T = corners()
+    T = T @ exp([0.1, -0.2, 0.15, 0.05, -0.03, 0.02])
+    near = distances2 == 0.0
+    i, q = np.nonzero(near)[0], indices[near]
+
+    def J(xi):
+        moved = transform(T @ exp(xi), P)[i] - Q[q]
+        return 0.5 * np.sum(np.einsum("ij,ij->i", moved, normals[q]) ** 2)
+
+    step, E = 1e-3, np.eye(6)
+    expected = [
+        [
+            sum(s * t * J(step * (s * a + t * b)) for s in (1, -1) for t in (1, -1))
+            / (4 * step**2)
+            for a in E
+        ]
+        for b in E
+    ]
+    found, _ = _implicit_derivative(cloud(P, normals), cloud(Q, normals), T, indices, near)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-3)
+
+
+def test_censi_grows_with_the_noise_and_refuses_free_directions(pair):
+    reading, reference, T = pair
+    config = IcpConfig()
+    found = nearest(reference.tree, transform(T, reading.points), config.n_neighbors)
+    small = censi(reading, reference, T, *found, config, 0.01)
+    large = censi(reading, reference, T, *found, config, 0.03)
+    np.testing.assert_allclose(large, 9.0 * small, rtol=1e-12)
+    assert (np.linalg.eigvalsh(small) > 0).all()
+    ground = prepare(
+        plane(np.random.default_rng(37), 2, -1.0, 3000)[0], CloudConfig(), np.random.default_rng(0)
+    )
+    itself = nearest(ground.tree, ground.points, config.n_neighbors)
+    with pytest.raises(RegistrationError, match="leaves a direction free"):
+        censi(ground, ground, np.eye(4), *itself, config, 0.01)
+
+
+def test_the_common_bias_is_the_answer_to_equal_residuals(pair):
+    reading, reference, T = pair
+    every = IcpConfig(n_neighbors=1, trim_ratio=1.0)
+    distances2, indices = nearest(reference.tree, transform(T, reading.points), 1)
+    b = common_bias(reading, reference, T, distances2, indices, every)
+    n = reference.normals[indices[:, 0]]
+    n = np.where(np.einsum("ij,ij->i", n, reference.points[indices[:, 0]])[:, None] < 0, n, -n)
+    m = n @ T[:3, :3]
+    J = np.hstack([m, np.cross(reading.points, m)])
+    expected = np.linalg.lstsq(J, np.ones(len(J)), rcond=None)[0]
+    np.testing.assert_allclose(b, expected, rtol=1e-6, atol=1e-9)

@@ -1,0 +1,103 @@
+"""Methods that need clouds, run on the pairs of a recording as a robot would run them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cello3d_ros.clouds.shape import Cloud, prepare
+from cello3d_ros.config import Pipeline
+from cello3d_ros.covariance.methods import METHODS, MethodSettings
+from cello3d_ros.covariance.model import Model
+from cello3d_ros.errors import CloudError, ModelError, RecordingError, RegistrationError
+from cello3d_ros.geometry.gaussian import is_positive_definite
+from cello3d_ros.geometry.se3 import Array, inverse
+from cello3d_ros.recordings.recording import Recording
+from cello3d_ros.registration.backends import register
+
+
+class Answer(NamedTuple):
+    """What one method said of one pair.
+
+    covariance: (6, 6), NaN where there is no answer; cpu_ms: processor time, on top of the
+    registration that is judged.
+    """
+
+    covariance: Array
+    cpu_ms: float
+
+
+def prepared(
+    recording: Recording, pipeline: Pipeline, needed: Sequence[int], seed: int = 0
+) -> tuple[dict[int, Cloud], dict[int, Array]]:
+    """Return the clouds and the true poses of some scans, by number.
+
+    Raises RecordingError for a scan that is missing, too poor or has no ground truth.
+    """
+    clouds: dict[int, Cloud] = {}
+    poses: dict[int, Array] = {}
+    wanted = set(needed)
+    for k, scan in enumerate(recording):
+        if k not in wanted:
+            continue
+        if scan.T_world_sensor is None:
+            raise RecordingError(f"{recording.name}: scan {k} has no ground truth")
+        try:
+            clouds[k] = prepare(scan.points, pipeline.cloud, np.random.default_rng([seed, k]))
+        except CloudError as error:
+            raise RecordingError(f"{recording.name}: scan {k}: {error}") from None
+        poses[k] = scan.T_world_sensor
+    if missing := sorted(wanted - set(clouds)):
+        raise RecordingError(f"{recording.name} has {len(recording)} scans, no scan {missing[0]}")
+    return clouds, poses
+
+
+def answers(
+    recording: Recording,
+    pairs: Sequence[tuple[int, int]],
+    model: Model,
+    settings: MethodSettings,
+    seed: int = 0,
+) -> Iterator[dict[str, Answer]]:
+    """Yield, for each pair (i, j) of scans, what every method says of it.
+
+    The registration that is judged starts from the truth, where pairs of a dataset are described
+    too, so that methods with and without clouds judge the same one.
+    """
+    needed = sorted({k for pair in pairs for k in pair})
+    clouds, poses = prepared(recording, model.pipeline, needed, seed)
+
+    def every(i: int, j: int) -> dict[str, Answer]:
+        rng = np.random.default_rng([seed, i, j])
+        T_mean = inverse(poses[i]) @ poses[j]
+        T_hat = register(clouds[j], clouds[i], T_mean, model.pipeline.icp, rng).T_ref_read
+        return {
+            name: _answer(name, clouds[j], clouds[i], T_hat, model, rng, settings)
+            for name in METHODS
+        }
+
+    for ij in pairs[:1]:
+        every(*ij)  # compiles what there is to compile, so that the times below are without it
+    for ij in pairs:
+        yield every(*ij)
+
+
+def _answer(
+    name: str,
+    reading: Cloud,
+    reference: Cloud,
+    T_hat: Array,
+    model: Model,
+    rng: np.random.Generator,
+    settings: MethodSettings,
+) -> Answer:
+    start = time.process_time()
+    try:
+        Y = METHODS[name](reading, reference, T_hat, model.pipeline, model, rng, settings)
+    except (RegistrationError, ModelError):
+        Y = np.full((6, 6), np.nan)
+    cpu_ms = 1e3 * (time.process_time() - start)
+    return Answer(Y if is_positive_definite(Y) else np.full((6, 6), np.nan), cpu_ms)

@@ -1,0 +1,238 @@
+"""``cello3d evaluate``: what is refused, what is written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cello3d_ros.cli.main import main
+from cello3d_ros.clouds.shape import Cloud
+from cello3d_ros.config import SamplingConfig
+from cello3d_ros.covariance.model import constant_model, save_model
+from cello3d_ros.geometry.se3 import Array, exp, inverse, transform
+from cello3d_ros.learning.dataset import PairRecord, open_dataset
+from cello3d_ros.registration.icp import Registration
+
+METHODS = {
+    "mean_covariance",
+    "model",
+    "constant_relative",
+    "hessian",
+    "hessian_scaled",
+    "sandwich",
+    "sandwich_scaled",
+}
+ONLINE = {"censi", "censi_scaled", "sigma_points", "sigma_points_scaled", "monte_carlo", "fused"}
+KEYS = {"kl_mean", "kl_median", "kl_ratio", "dm2_over_6", "coverage_95", "ms_per_pair"}
+SAMPLING = SamplingConfig(variance=1e-3)
+
+
+def record(name: str, i: int, offset_m: float = 0.0, n_features: int = 704) -> PairRecord:
+    rng = np.random.default_rng([i, *name.encode()])
+    xi = rng.normal(size=(60, 6)) * 0.01
+    xi[:, 0] += offset_m
+    Y = xi.T @ xi / 59
+    return PairRecord(
+        recording=name,
+        i=i,
+        j=i + 1,
+        accepted=True,
+        T_mean=np.eye(4),
+        xi=xi,
+        kept=np.ones(60, np.bool_),
+        covariance=Y,
+        descriptors=rng.random((1, n_features), dtype=np.float32),
+        rotations_rad=np.zeros(1),
+        shapes={"sandwich": Y / 4.0, "hessian": Y * 100.0},
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Dataset of a trained, a validation and two test recordings; the model beside it."""
+    dataset = open_dataset(tmp_path / "set", sampling=SAMPLING, create=True)
+    for name in ("hall_s0", "hall_s1", "hall_s2", "walk"):
+        for i in range(2):
+            dataset.write(record(name, i, 0.2 if (name, i) == ("hall_s2", 1) else 0.0))
+    provenance = {"recordings": {"hall_s0": 2}, "validation_recordings": {"hall_s1": 2}}
+    model = constant_model(
+        4.0 * np.eye(6), 704, shape="sandwich", sampling=SAMPLING, provenance=provenance
+    )
+    save_model(model, tmp_path / "model.npz")
+    return tmp_path
+
+
+@pytest.fixture
+def walk(tmp_path: Path, room: tuple[Array, Array]) -> Path:
+    """A KITTI folder of three scans of a room."""
+    (tmp_path / "walk" / "velodyne").mkdir(parents=True)
+    rows = []
+    for k, scan in enumerate((room[0], room[1], room[0][::-1])):
+        T = exp([0.3 * k, 0.1 * k, 0, 0, 0, 0.1 * k])
+        points = np.zeros((len(scan), 4), "<f4")
+        points[:, :3] = transform(inverse(T), scan)
+        points.tofile(tmp_path / "walk" / "velodyne" / f"{k:06}.bin")
+        rows.append(T[:3].ravel())
+    np.savetxt(tmp_path / "walk" / "poses.txt", rows)
+    return tmp_path / "walk"
+
+
+def evaluate(folder: Path, *words: object) -> int:
+    return main(["evaluate", *map(str, (folder / "set", "--model", folder / "model.npz", *words))])
+
+
+def complaint(capsys: pytest.CaptureFixture[str]) -> str:
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.count("\n") == 1
+    return said.err
+
+
+def test_figures_are_written_and_printed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate(folder, "--only", "walk", "--json", folder / "e.json") == 0
+    report = json.loads((folder / "e.json").read_text())
+    assert report["n_pairs"] == 2
+    assert set(report["methods"]) == METHODS
+    for name, figures in report["methods"].items():
+        assert set(figures) >= KEYS, name
+        assert figures["ms_per_pair"] is None
+    assert report["methods"]["model"]["kl_mean"] == pytest.approx(0.0, abs=1e-9)
+    assert report["methods"]["model"]["dm2_over_6"] == pytest.approx(1.0)
+    assert report["methods"]["sandwich_scaled"]["scale"] == pytest.approx(4.0)
+    assert report["trajectories"] == {}
+    assert [pair["i"] for pair in report["pairs"]] == [0, 1]
+    assert "with_flagged_pairs" not in report
+    printed = capsys.readouterr().out
+    assert "walk (2 pairs)" in printed
+    assert "constant relative" in printed
+    assert sorted(path.name for path in folder.iterdir()) == ["e.json", "model.npz", "set"]
+
+
+def test_pairs_with_suspected_poses_are_named_and_left_out(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--only", "hall_s2", "walk", "--json", folder / "e.json")
+    assert evaluate(folder, *words) == 0
+    report = json.loads((folder / "e.json").read_text())
+    check = report["pose_check"]["hall_s2"]
+    assert (check["n_pairs"], check["n_flagged"], check["flagged"]) == (2, 1, [[1, 2]])
+    assert report["n_pairs"] == 3
+    assert report["recordings"]["hall_s2"]["n_pairs"] == 1
+    assert report["with_flagged_pairs"]["n_pairs"] == 4
+    assert "suspected of wrong poses: 1-2" in capsys.readouterr().out
+    assert evaluate(folder, *words, "--exact-poses", "hall_*") == 0
+    report = json.loads((folder / "e.json").read_text())
+    assert report["n_pairs"] == 4
+    assert report["pose_check"]["hall_s2"]["flagged"] == []
+    assert report["pose_check"]["hall_s2"]["offset_m"] > 0.05
+
+
+def test_recordings_that_the_model_has_seen_are_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate(folder, "--json", folder / "e.json") == 1
+    said = complaint(capsys)
+    assert "trained or validated on hall_s0, hall_s1:" in said
+    assert "hall_s2" not in said
+    assert not (folder / "e.json").exists()
+    assert evaluate(folder, "--allow-seen") == 0
+
+
+def test_methods_on_clouds_and_trajectories(folder: Path, walk: Path) -> None:
+    words = ("--only", "walk", "--recordings", walk, "--registrations", 10, "--jobs", 1)
+    out = ("--trajectories", 3, "--json", folder / "e.json")
+    assert evaluate(folder, *words, *out) == 0
+    report = json.loads((folder / "e.json").read_text())
+    assert set(report["methods"]) == METHODS | ONLINE
+    for name in ("censi", "sigma_points", "monte_carlo", "fused"):
+        assert report["methods"][name]["n_pairs"] == 2, name
+        assert report["methods"][name]["ms_per_pair"] > 0.0
+        assert np.isfinite(report["methods"][name]["kl_ratio"])
+    assert report["methods"]["model"]["kl_mean"] == pytest.approx(0.0, abs=1e-9)
+    assert [report["methods"][n]["icp_runs"] for n in ("model", "sigma_points", "fused")] == [
+        0,
+        12,
+        10,
+    ]
+    row = report["trajectories"]["walk"]
+    assert row["length_m"] == pytest.approx(2 * np.hypot(0.3, 0.1), rel=0.05)
+    assert row["n_runs"] == 3
+    assert {"dm_6dof", "dm_translation", "dm_rotation"} <= set(row)
+    assert row["error_m"] < 0.05
+
+
+def test_the_registration_that_is_judged_starts_from_the_truth(
+    folder: Path, walk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts = []
+
+    def remember(reading: Cloud, reference: Cloud, T_init: Array, *rest: object) -> Registration:
+        starts.append(T_init)
+        return Registration(T_init, 1, True, "", 0.0, 1)
+
+    monkeypatch.setattr("cello3d_ros.learning.online.register", remember)
+    words = ("--only", "walk", "--recordings", walk, "--online-pairs", 1)
+    assert evaluate(folder, *words) == 0
+    T_0, T_1 = np.eye(4), exp([0.3, 0.1, 0, 0, 0, 0.1])
+    np.testing.assert_allclose(starts[-1], inverse(T_0) @ T_1, atol=1e-6)
+
+
+def test_some_pairs_are_enough_for_methods_on_clouds(folder: Path, walk: Path) -> None:
+    words = ("--only", "walk", "--recordings", walk, "--registrations", 10)
+    assert evaluate(folder, *words, "--online-pairs", 1, "--json", folder / "e.json") == 0
+    report = json.loads((folder / "e.json").read_text())
+    assert report["methods"]["censi"]["n_pairs"] == 1
+    assert report["methods"]["model"]["n_pairs"] == 2
+    assert report["trajectories"] == {}
+
+
+def test_the_baseline_may_lie_elsewhere(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = open_dataset(folder / "other", sampling=SAMPLING, create=True)
+    other.write(record("street", 0))
+    words = [str(folder / "other"), "--model", str(folder / "model.npz")]
+    assert main(["evaluate", *words]) == 1
+    assert "'hall_s0' that the model was trained on; name one by --baseline" in complaint(capsys)
+    assert main(["evaluate", *words, "--baseline", str(folder / "set")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--only", "hal"), "no recording matches 'hal': there are hall_s0,"),
+        (("--only", "walk", "--trajectories", 3), "trajectories need clouds"),
+        (("--only", "walk", "--json", "/nowhere/e.json"), "cannot write /nowhere/e.json"),
+        (("--only", "walk", "--sensor-sigma", 0), "noise must be positive"),
+        (("--only", "hall_s2", "--recordings", "{walk}"), "'walk' is not among those evaluated"),
+        (("--only", "walk", "--recordings", "/nowhere"), "no such file"),
+    ],
+)
+def test_what_does_not_fit_is_said_in_one_sentence(
+    words: tuple[object, ...],
+    reason: str,
+    folder: Path,
+    walk: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert evaluate(folder, *(str(word).format(walk=walk) for word in words)) == 1
+    assert reason in complaint(capsys)
+
+
+def test_a_pair_beyond_the_recording_is_said(
+    folder: Path, walk: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    open_dataset(folder / "set").write(record("walk", 7))
+    assert evaluate(folder, "--only", "walk", "--recordings", walk) == 1
+    assert "walk has 3 scans, no scan 7" in complaint(capsys)
+
+
+def test_descriptors_of_another_length_are_said(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = open_dataset(folder / "short", sampling=SAMPLING, create=True)
+    other.write(record("street", 0, n_features=22))
+    words = [str(folder / "short"), "--baseline", str(folder / "set")]
+    assert main(["evaluate", *words, "--model", str(folder / "model.npz")]) == 1
+    assert "descriptor has shape (22,)" in complaint(capsys)
