@@ -1,10 +1,11 @@
 """Exact nearest neighbours: a balanced k-d tree of boxes, in compiled kernels.
 
-Neighbours serve both the local shape of a cloud and ICP, hence this lowest room.  The tree is
-implicit: node i has the children 2i + 1 and 2i + 2, and each half of a node's points goes to one
-child, so that only the nodes' bounding boxes and the leaves' ranges of points are stored.  A box
-is pruned when its distance is not below that of the k-th neighbour found so far: exact.  Kernels
-release the GIL, so that threads can share a tree.
+They serve the local shape of a cloud and the overlap of two, hence this lowest room; ICP has a
+search of its own (``registration/search.py``).  The tree is implicit: node i has the children
+2i + 1 and 2i + 2, and each half of a node's points goes to one child, so that only the nodes'
+bounding boxes and the leaves' ranges of points are stored.  A box is pruned when its distance is
+not below that of the k-th neighbour found so far: exact.  Kernels release the GIL, so that threads
+can share a tree.
 """
 
 from __future__ import annotations
