@@ -129,7 +129,8 @@ def run(arguments: argparse.Namespace) -> None:
     keys = _accepted(datasets, names)
     predictions = from_dataset(model, examples, mean, settings)
     _add_online(predictions, keys, recordings, model, settings, arguments)
-    report = {"model": str(path), "shape": model.shape, "settings": settings._asdict()}
+    report: dict[str, Any] = {"model": str(path), "shape": model.shape}
+    report["settings"] = settings._asdict()
     report |= _pairs_report(predictions, examples, keys, settings, arguments.exact_poses)
     report["worst_pairs"] = _worst_pairs(datasets, report["pairs"], keys, predictions)
     report["trajectories"] = _trajectories(recordings, model, arguments)
