@@ -3,7 +3,9 @@ import pytest
 
 from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import GridConfig, IcpConfig, OverlapConfig, Pipeline
-from cello3d_ros.covariance.estimator import describe, estimate, turns
+from cello3d_ros.covariance.description import describe, turns
+from cello3d_ros.covariance.estimator import estimate, registered_elsewhere
+from cello3d_ros.covariance.methods import METHODS
 from cello3d_ros.covariance.model import constant_model
 from cello3d_ros.errors import ModelError, NoOverlapError, RegistrationError
 from cello3d_ros.geometry.gaussian import is_positive_definite
@@ -78,6 +80,36 @@ def test_an_estimate_registers_and_predicts(pair):
     S = describe(reading, reference, found.registration.T_ref_read, PIPELINE).shapes["sandwich"]
     np.testing.assert_allclose(found.covariance, 2.0 * S, rtol=1e-6, atol=1e-16)
     assert is_positive_definite(found.covariance)
+
+
+def test_a_registration_from_elsewhere_is_judged_as_it_is(pair):
+    model = constant_model(2.0 * np.eye(6), 704, shape="sandwich")
+    T = T_TRUE @ exp([0.01, 0, 0, 0, 0, 0.002])
+    rng = np.random.default_rng(1)
+    found = estimate(
+        *pair, np.full((4, 4), np.nan), model, PIPELINE, rng, registration=registered_elsewhere(T)
+    )
+    np.testing.assert_array_equal(found.registration.T_ref_read, T)
+    S = describe(*pair, T, PIPELINE).shapes["sandwich"]
+    np.testing.assert_allclose(found.covariance, 2.0 * S, rtol=1e-6, atol=1e-16)
+
+
+def test_an_estimate_is_by_the_method_that_it_names(pair):
+    model = constant_model(2.0 * np.eye(6), 704, shape="sandwich")
+    found = {
+        name: estimate(*pair, T_TRUE, model, PIPELINE, np.random.default_rng(1), name)
+        for name in ("model", "fused", "sigma_points", "censi", "hessian", "constant")
+    }
+    assert set(found) <= set(METHODS)
+    for name, answer in found.items():
+        assert answer.method == name
+        assert is_positive_definite(answer.covariance)
+    H = describe(*pair, found["hessian"].registration.T_ref_read, PIPELINE).shapes["hessian"]
+    np.testing.assert_allclose(found["hessian"].covariance, 1e-4 * H, rtol=1e-6, atol=1e-18)
+    np.testing.assert_allclose(
+        found["constant"].covariance, found["model"].covariance, rtol=1e-9, atol=1e-16
+    )
+    assert not np.allclose(found["fused"].covariance, found["model"].covariance, rtol=1e-3)
 
 
 def test_clouds_that_share_too_little_are_an_error(pair):
