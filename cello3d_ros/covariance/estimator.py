@@ -12,6 +12,7 @@ from cello3d_ros.covariance.description import describe
 from cello3d_ros.covariance.methods import DEFAULTS, METHODS, MethodSettings, Pair, predicted
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import ModelError, RegistrationError
+from cello3d_ros.geometry.gaussian import larger
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.backends import register
 from cello3d_ros.registration.icp import Registration
@@ -65,10 +66,12 @@ def estimate(
     Y = prediction.covariance
     if method != "model":
         Y = METHODS[method](pair, pipeline, model, rng, settings)
+    if prediction.nearest_rho > settings.rho_limit:
+        Y = larger(METHODS["constant"](pair, pipeline, model, rng, settings), Y)
     return Estimate(
         registration,
         description.overlap_ratio,
-        Y,
+        settings.scale * Y,
         prediction.nearest_rho,
         prediction.effective_neighbors,
         method,

@@ -7,6 +7,7 @@ definite covariance of its registration, reading side, ordered (u, omega).  The 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -35,14 +36,17 @@ class Pair(NamedTuple):
 
 
 class MethodSettings(NamedTuple):
-    """What the baselines assume.
+    """What methods assume and what is made of their answers.
 
     sigma_m: deviation of the sensor's noise along each axis; n_registrations: extra runs of ICP
-    by ``monte_carlo`` and ``fused``.
+    by ``monte_carlo`` and ``fused``; rho_limit: ``nearest_rho`` beyond which ``estimate`` widens
+    an answer to the mean of the examples; scale: what ``estimate`` multiplies answers by.
     """
 
     sigma_m: float = 0.01
     n_registrations: int = 12
+    rho_limit: float = math.inf
+    scale: float = 1.0
 
 
 Method = Callable[[Pair, Pipeline, Model, np.random.Generator, MethodSettings], Array]
