@@ -158,9 +158,30 @@ class NodeConfig(Section):
     max_pair_gap_s: float = _setting(10.0, "scans farther apart are not paired", 0.0)
     max_failures: int = _setting(3, "failed pairs before the reference is given up", 1)
     future_tolerance_s: float = _setting(0.5, "a cloud stamped later than now + this", 0.0)
+    covariance_mode: str = _setting(
+        "cello3d",
+        "what says how far a registration is to be trusted",
+        choices=("cello3d", "fused", "sigma_points", "censi", "hessian", "constant"),
+    )
+    sensor_sigma_m: float = _setting(
+        0.01, "range noise that censi, hessian and sigma_points assume", 1e-6, 10.0
+    )
+    n_registrations: int = _setting(12, "extra runs of ICP of the mode fused", 1, 200)
+    scale: float = _setting(1.0, "every covariance is multiplied by this", 1e-6, 1e6)
+    unknown_quantile: float = _setting(
+        0.99, "share of the model's examples nearer to another recording than a known pair", 0.0, 1.0
+    )
+    inflate_unknown: bool = _setting(
+        False, "widen the covariance of an unknown pair to the mean of the model's examples"
+    )
+    warn_sigma_m: float = _setting(0.3, "3 sigma along the weakest axis that warns", 0.0)
+    error_sigma_m: float = _setting(1.0, "3 sigma along the weakest axis that is an error", 0.0)
     floor_sigma_m: float = _setting(1e-4, "smallest published standard deviation", 1e-9)
     floor_sigma_rad: float = _setting(1e-5, "smallest published standard deviation", 1e-9)
     ceiling: float = _setting(900.0, "largest published eigenvalue (m^2, rad^2)", 1e-6, 1e3)
+    marker_scale: float = _setting(1.0, "~/markers are drawn this many times as large", 1e-3, 1e6)
+    marker_lifetime_s: float = _setting(10.0, "~/markers vanish after this; 0 is never", 0.0)
+    publish_tf: bool = _setting(False, "publish ~/pose on /tf as well; needs tf2_msgs")
     seed: int = _setting(0, "seed of the random subsamples", 0)
 
     def __post_init__(self) -> None:
@@ -171,6 +192,12 @@ class NodeConfig(Section):
                 "NodeConfig.T_base_sensor needs x y z and a unit quaternion qx qy qz qw: "
                 f"{self.T_base_sensor}"
             )
+        for name in ("floor_sigma_m", "floor_sigma_rad"):
+            if (floor := getattr(self, name)) ** 2 >= self.ceiling:
+                raise ConfigError(
+                    f"NodeConfig.{name} must be below the root of NodeConfig.ceiling, "
+                    f"{math.sqrt(self.ceiling):g}: {floor}"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)

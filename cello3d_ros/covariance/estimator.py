@@ -23,7 +23,7 @@ class Estimate(NamedTuple):
 
     covariance: (6, 6), reading side, ordered (u, omega), by ``method``; nearest_rho: squared
     distance of the model's nearest training example; effective_neighbors: how many examples
-    share in the model's answer.
+    share in the model's answer; is_unknown: whether the nearest is beyond the settings' limit.
     """
 
     registration: Registration
@@ -32,6 +32,7 @@ class Estimate(NamedTuple):
     nearest_rho: float
     effective_neighbors: float
     method: str = "model"
+    is_unknown: bool = False
 
 
 def estimate(
@@ -66,7 +67,8 @@ def estimate(
     Y = prediction.covariance
     if method != "model":
         Y = METHODS[method](pair, pipeline, model, rng, settings)
-    if prediction.nearest_rho > settings.rho_limit:
+    is_unknown = prediction.nearest_rho > settings.rho_limit
+    if is_unknown and settings.widen_unknown:
         Y = larger(METHODS["constant"](pair, pipeline, model, rng, settings), Y)
     return Estimate(
         registration,
@@ -75,6 +77,7 @@ def estimate(
         prediction.nearest_rho,
         prediction.effective_neighbors,
         method,
+        is_unknown,
     )
 
 

@@ -39,13 +39,15 @@ class MethodSettings(NamedTuple):
     """What methods assume and what is made of their answers.
 
     sigma_m: deviation of the sensor's noise along each axis; n_registrations: extra runs of ICP
-    by ``monte_carlo`` and ``fused``; rho_limit: ``nearest_rho`` beyond which ``estimate`` widens
-    an answer to the mean of the examples; scale: what ``estimate`` multiplies answers by.
+    by ``monte_carlo`` and ``fused``.  What ``estimate`` makes of any answer: rho_limit, the
+    ``nearest_rho`` beyond which the pair is unlike all examples; widen_unknown, whether it is
+    then widened to their mean; scale, a factor for every covariance.
     """
 
     sigma_m: float = 0.01
     n_registrations: int = 12
     rho_limit: float = math.inf
+    widen_unknown: bool = False
     scale: float = 1.0
 
 

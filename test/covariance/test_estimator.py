@@ -169,19 +169,31 @@ def two_examples(pair, far: float):
 
 @pytest.mark.parametrize("method", ["model", "hessian"])
 def test_an_answer_far_from_every_example_is_widened_to_their_mean(pair, method):
-    model, settings = two_examples(pair, 3.0), MethodSettings(rho_limit=4.0)
+    model, settings = two_examples(pair, 3.0), MethodSettings(rho_limit=4.0, widen_unknown=True)
     assert settings.rho_limit < 9.0
     rng = [np.random.default_rng(5) for _ in range(3)]
     plain = estimate(*pair, T_TRUE, model, PIPELINE, rng[0], method)
     found = estimate(*pair, T_TRUE, model, PIPELINE, rng[1], method, settings)
     mean = model.covariances.mean(axis=0)
     assert found.nearest_rho == plain.nearest_rho > settings.rho_limit
+    assert (plain.is_unknown, found.is_unknown) == (False, True)
     for smaller in (plain.covariance, mean):
         assert np.linalg.eigvalsh(found.covariance - smaller)[0] > -1e-15
     assert np.linalg.eigvalsh(found.covariance - plain.covariance)[-1] > 1e-3
     near = two_examples(pair, 0.5)
     kept = estimate(*pair, T_TRUE, near, PIPELINE, rng[2], method, settings)
     assert np.linalg.eigvalsh(kept.covariance)[-1] < 1e-3
+    assert not kept.is_unknown
+
+
+def test_an_answer_far_from_every_example_is_only_told_of_unless_it_is_to_be_widened(pair):
+    model = two_examples(pair, 3.0)
+    rng = [np.random.default_rng(5) for _ in range(2)]
+    plain = estimate(*pair, T_TRUE, model, PIPELINE, rng[0])
+    settings = MethodSettings(rho_limit=4.0)
+    found = estimate(*pair, T_TRUE, model, PIPELINE, rng[1], settings=settings)
+    np.testing.assert_array_equal(found.covariance, plain.covariance)
+    assert found.is_unknown
 
 
 def test_an_answer_is_scaled_last(pair):
@@ -189,7 +201,7 @@ def test_an_answer_is_scaled_last(pair):
     plain, scaled = (
         estimate(
             *(*pair, T_TRUE, model, PIPELINE, np.random.default_rng(5)),
-            settings=MethodSettings(rho_limit=4.0, scale=scale),
+            settings=MethodSettings(rho_limit=4.0, widen_unknown=True, scale=scale),
         )
         for scale in (1.0, 2.5)
     )
