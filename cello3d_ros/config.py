@@ -148,6 +148,7 @@ class NodeConfig(Section):
     """What only the node needs."""
 
     model: str = _setting("", "model file; empty is the shipped one")
+    autostart: bool = _setting(True, "configure and activate at once; false waits to be told")
     T_base_sensor: tuple[float, ...] = _setting(
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
         "sensor in the odometry's child frame: x y z qx qy qz qw",
@@ -169,10 +170,13 @@ class NodeConfig(Section):
     n_registrations: int = _setting(12, "extra runs of ICP of the mode fused", 1, 200)
     scale: float = _setting(1.0, "every covariance is multiplied by this", 1e-6, 1e6)
     unknown_quantile: float = _setting(
-        0.99, "share of the model's examples nearer to another recording than a known pair", 0.0, 1.0
+        0.99,
+        "share of the model's examples nearer to another recording than a known pair",
+        0.0,
+        1.0,
     )
     inflate_unknown: bool = _setting(
-        False, "widen the covariance of an unknown pair to the mean of the model's examples"
+        True, "widen the covariance of an unknown pair to the mean of the model's examples"
     )
     warn_sigma_m: float = _setting(0.3, "3 sigma along the weakest axis that warns", 0.0)
     error_sigma_m: float = _setting(1.0, "3 sigma along the weakest axis that is an error", 0.0)
@@ -230,6 +234,7 @@ SECTIONS: dict[str, type[Any]] = {
 }
 
 PIPELINE = ("cloud", "icp", "overlap", "grid")
+_SCATTER = ("variance", "noise_m")  # of sampling: what the registrations of a model scattered by
 
 S = TypeVar("S", bound=Section)
 
@@ -279,12 +284,22 @@ def pipeline_of(config: Pipeline) -> Pipeline:
 
 
 def differences(ours: Pipeline, theirs: Pipeline) -> list[str]:
-    """Name each pipeline setting that differs: ``icp.trim_ratio is 0.8, not 0.7``."""
-    return [
-        f"{name}.{key} is {value}, not {getattr(getattr(theirs, name), key)}"
+    """Name each setting that differs and matters: ``icp.trim_ratio is 0.8, not 0.7``.
+
+    Those of the pipeline, and of two whole Configs the variances of sampling.
+    """
+    settings = [
+        (name, field.name)
         for name in PIPELINE
-        for key, value in dataclasses.asdict(getattr(ours, name)).items()
-        if value != getattr(getattr(theirs, name), key)
+        for field in dataclasses.fields(getattr(ours, name))
+    ]
+    if isinstance(ours, Config) and isinstance(theirs, Config):
+        settings += [("sampling", key) for key in _SCATTER]
+    return [
+        f"{name}.{key} is {value}, not {other}"
+        for name, key in settings
+        if (value := getattr(getattr(ours, name), key))
+        != (other := getattr(getattr(theirs, name), key))
     ]
 
 

@@ -8,6 +8,8 @@ from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry.gaussian import symmetrized, to_fixed_axes
 from cello3d_ros.geometry.se3 import Array
 
+N_SIGMA = 3.0  # of what is shown and judged
+
 _CONDITION = 1e-13  # least ratio of eigenvalues that still is positive definite when rounded
 _HUGE = 1e12  # times the ceiling: beyond it a covariance is scaled down, so that nothing overflows
 
@@ -38,8 +40,9 @@ def twist_covariance(
     The twist is ``log(T_ref_read) / dt``, along the axes of the reading and constant over the
     step; to first order in the error and for a short step (times ``Jr^-1``, right Jacobian of the
     step, for a long one), so that ``dt^2`` times it is the covariance of the step again, which is
-    what fuse makes of it.  Y: (6, 6), ordered (u, omega), reading side.  Returns (6, 6) in m^2/s^2 and rad^2/s^2 within the bounds of ``bounded``, whose
-    floors are those of the pose over dt.  Raises CovarianceError for a Y that is not finite.
+    what fuse makes of it.  Y: (6, 6), ordered (u, omega), reading side.  Returns (6, 6) in
+    m^2/s^2 and rad^2/s^2 within the bounds of ``bounded``, whose floors are those of the pose
+    over dt.  Raises CovarianceError for a Y that is not finite.
     """
     C = _tamed(_tamed(Y, ceiling * dt_s**2) / dt_s**2, ceiling)
     return bounded(C, floor_sigma_m / dt_s, floor_sigma_rad / dt_s, ceiling)

@@ -1,4 +1,4 @@
-"""What the node has seen, as diagnostic_msgs/DiagnosticArray; docs/diagnostics.md has every key."""
+"""What the node has seen, as diagnostic_msgs/DiagnosticArray; every key: docs/diagnostics.md."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.ros.covariances import principal_axes
+from cello3d_ros.ros.covariances import N_SIGMA, principal_axes
 from cello3d_ros.ros.messages import time_of
 from cello3d_ros.ros.tracker import Answer
 
-ANSWERED, REFERENCE, WAITING = "answered", "reference", "waiting"
+ANSWERED, REFERENCE, WAITING, INACTIVE = "answered", "reference", "waiting", "inactive"
 OK, WARN, ERROR = 0, 1, 2
-N_SIGMA = 3.0
 
 _WINDOW = 200  # latencies remembered
 _RATE_WINDOW_S = 5.0
@@ -56,11 +55,16 @@ class Statistics:
         self._ages_s: deque[float] = deque(maxlen=_WINDOW)
         self._received_s: deque[float] = deque(maxlen=_WINDOW)
         self._answered_s: deque[float] = deque(maxlen=_WINDOW)
-        self._last_event, self._last_stamp_ns = WAITING, 0
+        self._last_event, self._last_stamp_ns = INACTIVE, 0
         self._last_failure = ""
         self._n_failed_in_a_row = 0
         self._verdict = Verdict(OK, "answered")
         self._answer: dict[str, str] = {}
+
+    def listen(self, is_listening: bool) -> None:
+        """Note that the node has begun, or ceased, to listen."""
+        self._last_event, self._last_stamp_ns = WAITING if is_listening else INACTIVE, 0
+        self._n_failed_in_a_row = 0
 
     def receive(self) -> None:
         """Count a cloud that came."""
@@ -132,6 +136,8 @@ class Statistics:
             return Verdict(ERROR if is_serious else WARN, f"no answer: {self._last_failure}")
         if self._last_event == WAITING:
             return Verdict(WARN, "waiting for clouds and odometry")
+        if self._last_event == INACTIVE:
+            return Verdict(OK, "inactive: not listening")
         if self._last_event == REFERENCE:
             return Verdict(OK, "the next cloud is registered to this one")
         return self._verdict
@@ -141,7 +147,7 @@ def _described(answer: Answer, C: Array) -> dict[str, str]:
     """Return the last answer in words; directions are those of the largest variance."""
     found = answer.estimate
     (sigma_m, axes), (sigma_rad, turns) = principal_axes(C[:3, :3]), principal_axes(C[3:, 3:])
-    eigenvalues = np.linalg.eigvalsh(C)[::-1]
+    eigenvalues = np.asarray(np.linalg.eigvalsh(C)[::-1], dtype=np.float64)
     return {
         "reference_stamp_ns": str(answer.reference_ns),
         "overlap_ratio": f"{found.overlap_ratio:.4f}",

@@ -2,9 +2,9 @@
 
 Four markers an answer, each in a namespace of its own: ``translation``, the ellipsoid of 3
 standard deviations of the registration's translation; ``rotation``, that of its rotation, one
-radian drawn as ``RADIAN_M`` metres (how far a point at that distance is off); ``weakest``, an arrow
-along the translation's longest axis; ``chain``, the translation's ellipsoid of the accumulated
-pose.  All stand at the accumulated pose, in its frame.
+radian drawn as ``RADIAN_M`` metres (how far a point at that distance is off); ``weakest``, an
+arrow along the translation's longest axis; ``chain``, the translation's ellipsoid of the
+accumulated pose.  All stand at the accumulated pose, in its frame.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.ros.covariances import principal_axes
+from cello3d_ros.ros.covariances import N_SIGMA, principal_axes
 from cello3d_ros.ros.messages import duration_of, pose_to, time_of
 
-N_SIGMA = 3.0
 RADIAN_M = 10.0
 N_TRAIL = 50  # answers shown; older ones are overwritten
 

@@ -28,17 +28,15 @@ class Outputs:
         """Announce the topics.  Raises ConfigError when TF is asked for and not there."""
         self._node = node
         self._n_answers = 0
-        tf_message = _tf_message() if config.publish_tf else None
+        self._tf_message = _tf_message() if config.publish_tf else None
         self._relative = node.create_publisher(PoseWithCovarianceStamped, "~/relative_pose", 10)
         self._pose = node.create_publisher(PoseWithCovarianceStamped, "~/pose", 10)
         self._odometry = node.create_publisher(Odometry, "~/odometry", 10)
         self._markers = node.create_publisher(MarkerArray, "~/markers", 10)
         self._publishers = [self._relative, self._pose, self._odometry, self._markers]
-        self._tf = None
-        if tf_message is not None:
-            self._tf = node.create_publisher(tf_message, "/tf", 100)
+        if self._tf_message is not None:
+            self._tf = node.create_publisher(self._tf_message, "/tf", 100)
             self._publishers.append(self._tf)
-        self._tf_message = tf_message
 
     def destroy(self) -> None:
         """Leave the graph."""
@@ -63,7 +61,7 @@ class Outputs:
         self._odometry.publish(odometry)
         self._relative.publish(relative)
         self._pose.publish(pose)
-        if self._tf is not None:
+        if self._tf_message is not None:
             T = messages.transform_to(
                 job.stamp_ns, odometry_frame, job.frame_id, answer.T_odom_read
             )
@@ -81,9 +79,7 @@ class Outputs:
         config: NodeConfig,
     ) -> MarkerArray:
         T = answer.T_odom_read
-        C_step = messages.ros_covariance(
-            answer.estimate.covariance, T[:3, :3], *_bounds(config)
-        )
+        C_step = messages.ros_covariance(answer.estimate.covariance, T[:3, :3], *_bounds(config))
         return markers_to(
             answer.stamp_ns,
             pose.header.frame_id,

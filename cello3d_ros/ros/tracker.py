@@ -13,10 +13,16 @@ import numpy as np
 from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import NodeConfig, Pipeline
 from cello3d_ros.covariance.estimator import Estimate, estimate
+from cello3d_ros.covariance.methods import METHODS, MethodSettings
 from cello3d_ros.covariance.model import Model
+from cello3d_ros.covariance.novelty import rho_limit
 from cello3d_ros.errors import CloudError, ModelError, NoOverlapError, RegistrationError
 from cello3d_ros.geometry.gaussian import compound_right, is_positive_definite
 from cello3d_ros.geometry.se3 import Array, inverse
+from cello3d_ros.ros.covariances import CovarianceError
+
+#: Names of METHODS by ``node.covariance_mode``.
+METHOD_OF = {"cello3d": "model"} | {name: name for name in METHODS}
 
 
 class NotConvergedError(RegistrationError):
@@ -55,6 +61,7 @@ class Tracker:
 
     def __init__(self, model: Model, pipeline: Pipeline, config: NodeConfig) -> None:
         self.model, self.pipeline, self.config = model, pipeline, config
+        self._rho_limit = rho_limit(model, config.unknown_quantile)
         self.n_failures = 0  # in a row, against the present reference
         self.n_restarts = 0
         self._reference: Frame | None = None
@@ -99,7 +106,11 @@ class Tracker:
 
     def _answer(self, reading: Frame, reference: Frame, rng: np.random.Generator) -> Answer:
         T_init = inverse(reference.T_odom_sensor) @ reading.T_odom_sensor
-        found = estimate(reading.cloud, reference.cloud, T_init, self.model, self.pipeline, rng)
+        found = estimate(
+            *(reading.cloud, reference.cloud, T_init, self.model, self.pipeline, rng),
+            method=METHOD_OF[self.config.covariance_mode],
+            settings=self._settings(),
+        )
         if not found.registration.converged:
             raise NotConvergedError(
                 f"ICP did not converge in {found.registration.n_iterations} iterations "
@@ -109,6 +120,16 @@ class Tracker:
             self._T_odom_ref, self._Y_chain, found.registration.T_ref_read, found.covariance
         )
         return Answer(reading.stamp_ns, reference.stamp_ns, found, T, Y)
+
+    def _settings(self) -> MethodSettings:
+        config = self.config
+        return MethodSettings(
+            sigma_m=config.sensor_sigma_m,
+            n_registrations=config.n_registrations,
+            rho_limit=self._rho_limit,
+            widen_unknown=config.inflate_unknown,
+            scale=config.scale,
+        )
 
     def _fail(self, frame: Frame) -> None:
         self.n_failures += 1
@@ -133,6 +154,7 @@ def reason_of(error: Exception) -> str:
         RegistrationError: "registration",
         ModelError: "beyond_model",
         CloudError: "too_few_points",
+        CovarianceError: "covariance",
     }
     return next((name for kind, name in names.items() if isinstance(error, kind)), "internal")
 

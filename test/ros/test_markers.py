@@ -64,7 +64,9 @@ def test_no_more_markers_than_the_trail_is_long() -> None:
             number, "odom", T, np.eye(6), np.eye(6), number=number, lifetime_s=2.5
         )
         keys |= {(marker.ns, marker.id) for marker in array.markers}
-        assert all(m.lifetime.sec == 2 and m.lifetime.nanosec == 500_000_000 for m in array.markers)
+        assert all(
+            m.lifetime.sec == 2 and m.lifetime.nanosec == 500_000_000 for m in array.markers
+        )
     assert len(keys) == 4 * markers.N_TRAIL
 
 
