@@ -6,7 +6,7 @@ import pytest
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.ros.frames import TransformBuffer
 from cello3d_ros.ros.guess import Locator
-from cello3d_ros.ros.intake import Intake, Job, stamp_order
+from cello3d_ros.ros.intake import Intake, Job, Skip, stamp_order
 from cello3d_ros.ros.odometry import OdometryBuffer, PoseSource
 
 S = 1_000_000_000
@@ -129,7 +129,7 @@ def test_a_cloud_whose_odometry_has_come_does_not_expire() -> None:
 def test_clear_names_what_it_forgot() -> None:
     intake = intake_of(odometry())
     intake.offer(job(S))
-    assert [skip.reason for skip in intake.clear()] == ["clock_jump"]
+    assert intake.clear("clock_jump", "time jumped") == [Skip(S, "clock_jump", "time jumped")]
     assert len(intake) == 0
 
 
