@@ -25,16 +25,18 @@ class Outputs:
         self._node.destroy_publisher(self._relative)
         self._node.destroy_publisher(self._pose)
 
-    def publish(self, job: Job, answer: Answer, odometry_frame: str, config: NodeConfig) -> Array:
+    def publish(self, job: Job, answer: Answer, config: NodeConfig) -> Array:
         """Publish an answer; return the (6, 6) covariance of the relative pose as published.
 
         Raises CovarianceError and publishes nothing when there is one that cannot be.
         """
         T_ref_read = answer.estimate.registration.T_ref_read
         relative = _pose(
-            job.stamp_ns, job.frame_id, T_ref_read, answer.estimate.covariance, config
+            job.stamp_ns, answer.frame_id, T_ref_read, answer.estimate.covariance, config
         )
-        pose = _pose(job.stamp_ns, odometry_frame, answer.T_odom_read, answer.Y_chain, config)
+        pose = _pose(
+            job.stamp_ns, answer.pose_frame_id, answer.T_odom_read, answer.Y_chain, config
+        )
         self._relative.publish(relative)
         self._pose.publish(pose)
         C: Array = relative.pose.covariance.reshape(6, 6)

@@ -70,17 +70,23 @@ class Tracker:
         self.last_restart = ""
         self._map: Map | None = None
         self._reference: Link | None = None
-        self.reset()
+        self._latest: Link | None = None
+        self._motion = Motion()
+        self._T_map_odom: Array = _ORIGIN
+
+    @property
+    def map_stamp_ns(self) -> int | None:
+        """Stamp of the reference cloud that came last, or None."""
+        return None if self._map is None else self._map.stamp_ns
 
     def reset(self, reason: str = "") -> None:
         """Forget the reference and the chain; the next scan starts anew.  A map stays."""
         if self._reference is not None:
             self.n_restarts += 1
             self.last_restart = reason
-        self._reference: Link | None = None
-        self._latest: Link | None = None
+        self._reference = self._latest = None
         self._motion = Motion()
-        self._T_map_odom: Array = _ORIGIN
+        self._T_map_odom = _ORIGIN
         self.n_failures = 0
 
     def take_map(self, stamp_ns: int, points: Array, frame_id: str) -> None:
