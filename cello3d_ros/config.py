@@ -153,6 +153,45 @@ class NodeConfig(Section):
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
         "sensor in the odometry's child frame: x y z qx qy qz qw",
     )
+    use_tf: bool = _setting(
+        False, "take the sensor in the odometry's child frame from /tf, not from T_base_sensor"
+    )
+    base_frame: str = _setting("base_link", "the child frame of odometry that names none")
+    output_frame: str = _setting(
+        "sensor",
+        "whose motion is published: the sensor's or the odometry's child frame's",
+        choices=("sensor", "base"),
+    )
+    pairing: str = _setting(
+        "consecutive",
+        "what a cloud is registered to: the one before, a keyframe, or the topic reference_points",
+        choices=("consecutive", "keyframe", "topics"),
+    )
+    keyframe_distance_m: float = _setting(1.0, "distance that makes a new keyframe", 0.0)
+    keyframe_angle_rad: float = _setting(0.35, "rotation that makes a new keyframe", 0.0)
+    keyframe_min_overlap: float = _setting(
+        0.6, "overlap below which a new keyframe is made", 0.0, 1.0
+    )
+    reference_range_m: float = _setting(
+        60.0, "points of reference_points used around the sensor", 1.0, 1e4
+    )
+    registration: str = _setting(
+        "icp",
+        "who registers: this node, or another program (external_odometry or external_pose)",
+        choices=("icp", "external"),
+    )
+    external_tolerance_s: float = _setting(
+        1e-3, "largest distance in time of an external pose and its cloud", 0.0, 1.0
+    )
+    guess_without_odometry: str = _setting(
+        "skip",
+        "what to do with a cloud for which no odometry came in time",
+        choices=("skip", "constant_velocity", "extrapolate"),
+    )
+    max_extrapolation_s: float = _setting(0.5, "odometry is not extrapolated farther", 0.0, 60.0)
+    max_odometry_speed_m_s: float = _setting(
+        50.0, "odometry that moves faster has jumped: the chain starts again", 1e-3
+    )
     odometry_timeout_s: float = _setting(0.5, "wait for odometry after a cloud's stamp", 0.0, 60.0)
     odometry_gap_s: float = _setting(1.0, "odometry farther apart is not interpolated", 0.0)
     odometry_buffer_s: float = _setting(10.0, "odometry remembered", 0.1, 3600.0)

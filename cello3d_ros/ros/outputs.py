@@ -43,19 +43,18 @@ class Outputs:
         for publisher in self._publishers:
             self._node.destroy_publisher(publisher)
 
-    def publish(
-        self, job: Job, answer: Answer, odometry_frame: str, config: NodeConfig
-    ) -> tuple[Array, Verdict]:
+    def publish(self, job: Job, answer: Answer, config: NodeConfig) -> tuple[Array, Verdict]:
         """Publish an answer; return the (6, 6) covariance of ~/relative_pose and what it is worth.
 
         Raises CovarianceError and publishes nothing when there is one that cannot be.
         """
         found = answer.estimate
         T_ref_read = found.registration.T_ref_read
-        relative = _pose(job.stamp_ns, job.frame_id, T_ref_read, found.covariance, config)
-        pose = _pose(job.stamp_ns, odometry_frame, answer.T_odom_read, answer.Y_chain, config)
-        twist, C_twist = _twist(answer, config)
-        odometry = messages.full_odometry(pose, job.frame_id, twist, C_twist)
+        relative = _pose(job.stamp_ns, answer.frame_id, T_ref_read, found.covariance, config)
+        pose = _pose(
+            job.stamp_ns, answer.pose_frame_id, answer.T_odom_read, answer.Y_chain, config
+        )
+        odometry = messages.full_odometry(pose, answer.child_frame_id, *_twist(answer, config))
         C: Array = relative.pose.covariance.reshape(6, 6)
         verdict = judged(C, found.is_unknown, config)
         self._odometry.publish(odometry)
@@ -63,7 +62,7 @@ class Outputs:
         self._pose.publish(pose)
         if self._tf_message is not None:
             T = messages.transform_to(
-                job.stamp_ns, odometry_frame, job.frame_id, answer.T_odom_read
+                job.stamp_ns, answer.pose_frame_id, answer.child_frame_id, answer.T_odom_read
             )
             self._tf.publish(self._tf_message(transforms=[T]))
         if self._markers.get_subscription_count() > 0:
@@ -107,7 +106,7 @@ def _twist(answer: Answer, config: NodeConfig) -> tuple[Array, Array]:
     Zero with the largest covariance where the reference is no scan shortly before: unknown.
     """
     dt_s = 1e-9 * (answer.stamp_ns - answer.reference_ns)
-    if not 0.0 < dt_s <= config.max_pair_gap_s:
+    if config.pairing == "topics" or not 0.0 < dt_s <= config.max_pair_gap_s:
         return np.zeros(6), config.ceiling * np.eye(6)
     found = answer.estimate
     C = twist_covariance(found.covariance, dt_s, *_bounds(config))

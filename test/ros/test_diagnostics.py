@@ -79,6 +79,10 @@ def reasons() -> set[str]:
             elif isinstance(node, ast.FunctionDef) and node.name in ("reason_of", "stamp_order"):
                 words = list(ast.walk(node))
             found |= {word.value for word in words if isinstance(word, ast.Constant)}
+    worker = (ROOT / "cello3d_ros" / "ros" / "worker.py").read_text()
+    waited_for = re.search(r'what = "([a-z ]+)" if .* else "([a-z ]+)"', worker)
+    assert waited_for
+    found |= {f"no_{what.replace(' ', '_')}" for what in waited_for.groups()}  # Intake
     return {name for name in found if re.fullmatch("[a-z_]+", str(name))} - {"later", "jump"}
 
 
