@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from cello3d_ros.config import TrainingConfig
-from cello3d_ros.covariance.model import Model
-from cello3d_ros.learning.dataset import Dataset
+from cello3d_ros.covariance.model import Model, load_model, save_model
+from cello3d_ros.errors import ModelError
+from cello3d_ros.learning.dataset import Dataset, package_versions
 from cello3d_ros.learning.examples import Examples, load_examples
 from cello3d_ros.learning.training import train
 from cello3d_ros.reproduction.datasets import Recordings, Workshop, sampled
@@ -40,14 +41,40 @@ def testable(recordings: Recordings) -> list[str]:
     ]
 
 
-def trained(found: dict[str, Dataset], key: str) -> tuple[dict[str, Model], Examples]:
+def trained(
+    workshop: Workshop, found: dict[str, Dataset], key: str
+) -> tuple[dict[str, Model], Examples]:
     """Return the models by name for the test on one sequence, and what they were trained on."""
     sets = [found[other] for other in SEQUENCES[key].trained_on]
     examples = load_examples(sets, [name for dataset in sets for name in dataset.recordings])
-    print(f"training for {key} on {', '.join(examples.n_pairs)}", file=sys.stderr)
     grouped = in_groups(examples)
-    models = {name: train(grouped, config).model for name, config in MODELS.items()}
+    models = {
+        name: _trained(workshop, f"{key}-{name}", grouped, config)
+        for name, config in MODELS.items()
+    }
     return models, examples
+
+
+def _trained(workshop: Workshop, name: str, examples: Examples, config: TrainingConfig) -> Model:
+    """Train, or take the model on disk where it was made of the same by the same."""
+    path = workshop.folder / "models" / f"{name}.npz"
+    with workshop.costs.of(f"training {name}"):
+        try:
+            model = load_model(path)
+            made_of = {k: model.provenance.get(k) for k in ("training", "recordings", "versions")}
+        except ModelError:
+            made_of = {}
+        wanted = {
+            "training": dataclasses.asdict(config),
+            "recordings": examples.n_pairs,
+            "versions": package_versions(),
+        }
+        if made_of != wanted:
+            print(f"training {name} on {', '.join(examples.n_pairs)}", file=sys.stderr)
+            model = train(examples, config).model
+            path.parent.mkdir(exist_ok=True)
+            save_model(model, path)
+    return model
 
 
 def in_groups(examples: Examples) -> Examples:

@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 
 from cello3d_ros.config import Pipeline, SamplingConfig
-from cello3d_ros.covariance.closed_form import censi
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.online import prepared
 from cello3d_ros.learning.sampling import sample_recording
 from cello3d_ros.recordings.scanner import SCANNERS
 from cello3d_ros.recordings.simulation import Simulation
-from cello3d_ros.registration.overlap import find_overlap
 from cello3d_ros.reproduction import drawing
 from cello3d_ros.reproduction.datasets import SCANNER
 from cello3d_ros.reproduction.result import Result, markdown_table
@@ -56,9 +54,8 @@ def _cube(sigma_m: float, n_samples: int, n_threads: int, seed: int) -> tuple[Ar
         reading, reference = (cube(rng, _N_POINTS, sigma_m) for _ in range(2))
         start = rng.normal(scale=0.05, size=(1, 6))
         found.append(errors(reading, reference, start, pipeline, n_threads, seed))
-    return sampled_covariance(np.concatenate(found)), censi_of(
-        reading, reference, pipeline, sigma_m
-    )
+    C = censi_of(reading, reference, np.eye(4), pipeline, sigma_m)
+    return sampled_covariance(np.concatenate(found)), C
 
 
 def _apartment(sigma_m: float, n_samples: int, n_threads: int, seed: int) -> tuple[Array, Array]:
@@ -68,9 +65,7 @@ def _apartment(sigma_m: float, n_samples: int, n_threads: int, seed: int) -> tup
     sampling = SamplingConfig(n_samples=n_samples, seed=seed)
     (record,) = sample_recording(recording, [(0, 1)], pipeline, sampling, n_threads)
     clouds, _ = prepared(recording, pipeline, [0, 1], seed)
-    T, icp = record.T_mean, pipeline.icp
-    found = find_overlap(clouds[1], clouds[0], T, pipeline.overlap.radius_m, icp.n_neighbors)
-    C = censi(clouds[1], clouds[0], T, found.distances2, found.indices, icp, sigma_m)
+    C = censi_of(clouds[1], clouds[0], record.T_mean, pipeline, sigma_m)
     return sampled_covariance(record.xi[record.kept]), C
 
 

@@ -27,7 +27,7 @@ def make(n_samples: int, n_threads: int, seed: int) -> Result:
     reading, reference = (cube(rng, _N_POINTS, SIGMA_M) for _ in range(2))
     xi = _sampled(n_samples, pipeline, n_threads, seed)
     Y = sampled_covariance(xi)
-    C = censi_of(reading, reference, pipeline, SIGMA_M)
+    C = censi_of(reading, reference, np.eye(4), pipeline, SIGMA_M)
     tree = cKDTree(reference.points)
     grids = []
     for half in _HALF_WIDTHS_M:

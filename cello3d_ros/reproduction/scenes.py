@@ -7,7 +7,7 @@ import numpy as np
 from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import CloudConfig, Pipeline
 from cello3d_ros.covariance.closed_form import censi
-from cello3d_ros.geometry.se3 import Array, exp, inverse, log
+from cello3d_ros.geometry.se3 import Array, exp, log
 from cello3d_ros.registration.icp import register_many
 from cello3d_ros.registration.overlap import find_overlap
 
@@ -95,8 +95,10 @@ def errors(
     return np.asarray(log(np.array(T).reshape(-1, 4, 4)))
 
 
-def censi_of(reading: Cloud, reference: Cloud, pipeline: Pipeline, sigma_m: float) -> Array:
-    """Return Censi's covariance at the truth, the identity.  (6, 6)."""
-    icp, T = pipeline.icp, inverse(np.eye(4))
+def censi_of(
+    reading: Cloud, reference: Cloud, T: Array, pipeline: Pipeline, sigma_m: float
+) -> Array:
+    """Return Censi's covariance of a registration T_ref_read (4, 4).  (6, 6)."""
+    icp = pipeline.icp
     found = find_overlap(reading, reference, T, pipeline.overlap.radius_m, icp.n_neighbors)
     return censi(reading, reference, T, found.distances2, found.indices, icp, sigma_m)

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cello3d_ros.covariance.methods import MethodSettings, by_censi
-from cello3d_ros.covariance.model import Model
+from cello3d_ros.covariance.methods import MethodSettings
 from cello3d_ros.errors import DatasetError, RegistrationError
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.learning.comparison import from_dataset
@@ -22,9 +21,10 @@ from cello3d_ros.reproduction import drawing
 from cello3d_ros.reproduction.datasets import Recordings, Workshop
 from cello3d_ros.reproduction.models import datasets, names_of, testable, trained, trained_on
 from cello3d_ros.reproduction.result import Result, markdown_table
+from cello3d_ros.reproduction.scenes import censi_of
 from cello3d_ros.reproduction.sequences import SEQUENCES
 
-SETTINGS = MethodSettings(sigma_m=0.01)
+SIGMA_M = 0.01  # that Censi assumes
 _METHODS = ("baseline", "paper", "relative", "censi")
 _KEPT = ("n_pairs", "kl_mean", "kl_median", "kl_trimmed_mean", "dm2_over_6", "coverage_95")
 
@@ -53,7 +53,7 @@ def make(workshop: Workshop, recordings: Recordings, source: str) -> Result:
         f"{workshop.n_samples} registrations a pair, trained on what the paper trained on. "
         f"*Baseline* is the mean of the training covariances, *paper's model* has the log-det "
         f"loss and nothing relative, *relative* averages covariances relative to each pair's "
-        f"sandwich. Censi assumes {100 * SETTINGS.sigma_m:g} cm of noise. The paper's ratios are "
+        f"sandwich. Censi assumes {100 * SIGMA_M:g} cm of noise. The paper's ratios are "
         f"on its own data, which are not these.\n\n" + markdown_table(_table(rows))
     )
     csv: list[list[Any]] = [["sequence", "trained_on", "method", *_KEPT]]
@@ -71,19 +71,19 @@ def _row(
     workshop: Workshop, found: dict[str, Dataset], recordings: Recordings, key: str
 ) -> dict[str, dict[str, Any]]:
     """Return the figures of every method on one sequence."""
-    models, training = trained(found, key)
+    models, training = trained(workshop, found, key)
     examples = load_examples([found[key]], names_of(found[key]))
     mean = training.covariances.mean(axis=0)
     F = {
-        name: from_dataset(model, examples, mean, SETTINGS).covariances["model"]
+        name: from_dataset(model, examples, mean, MethodSettings()).covariances["model"]
         for name, model in models.items()
     }
     F["baseline"] = np.tile(mean, (len(examples.covariances), 1, 1))
-    F["censi"] = _censi(found[key], recordings[key], models["paper"])
+    F["censi"] = _censi(found[key], recordings[key])
     return {name: figures(F[name], examples, F["baseline"]) for name in _METHODS}
 
 
-def _censi(dataset: Dataset, recordings: Sequence[Recording], model: Model) -> Array:
+def _censi(dataset: Dataset, recordings: Sequence[Recording]) -> Array:
     """Return Censi's covariance of every accepted pair, in the order of the examples; or NaN."""
     covariances = []
     by_name: dict[str, Recording] = {recording.name: recording for recording in recordings}
@@ -97,7 +97,7 @@ def _censi(dataset: Dataset, recordings: Sequence[Recording], model: Model) -> A
             T_mean = inverse(poses[i]) @ poses[j]
             T = register(clouds[j], clouds[i], T_mean, dataset.pipeline.icp, rng).T_ref_read
             try:
-                C = by_censi(clouds[j], clouds[i], T, dataset.pipeline, model, rng, SETTINGS)
+                C = censi_of(clouds[j], clouds[i], T, dataset.pipeline, SIGMA_M)
             except RegistrationError:
                 C = np.full((6, 6), np.nan)
             covariances.append(C)
