@@ -395,7 +395,7 @@ def test_figures_say_both_how_far_and_in_which_direction() -> None:
         xi=tuple(rng.multivariate_normal(np.zeros(6), 4 * Y, size=50) for _ in range(60)),
     )
     figures = train(examples, PAPER).figures["leave_recording_out"]
-    assert set(figures) == {"model", "mean_covariance", "constant_relative"}
+    assert set(figures) == {"model", "mean_covariance", "constant"}
     # all pairs have the same covariance, and the sampled errors are twice as large
     assert figures["model"]["kl_mean"] == pytest.approx(0.0, abs=1e-9)
     assert figures["model"]["mahalanobis2_over_6"] == pytest.approx(1.0)
@@ -411,7 +411,7 @@ def test_figures_say_both_how_far_and_in_which_direction() -> None:
     assert figures["mean_covariance"]["kl_trimmed_mean"] == pytest.approx(
         (40 * wide + 14 * narrow) / 54
     )
-    assert figures["constant_relative"] == figures["mean_covariance"]  # the shape is none
+    assert figures["constant"] == figures["mean_covariance"]  # the shape is none
 
 
 def test_one_recording_is_too_few() -> None:
