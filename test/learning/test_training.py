@@ -425,6 +425,13 @@ def test_a_recording_cannot_be_validated_on_and_trained_on() -> None:
         train(some(), PAPER, some(3))
 
 
+def test_a_singular_shape_is_one_sentence() -> None:
+    examples = some()
+    examples.shapes["sandwich"][5] = np.diag([1.0, 1, 1, 1, 1, 0])
+    with pytest.raises(DatasetError, match="the sandwich of a pair is singular to rounding"):
+        train(examples, TrainingConfig(shape="sandwich"))
+
+
 def test_a_missing_shape_is_named() -> None:
     with pytest.raises(DatasetError, match="does not hold the sandwich"):
         train(dataclasses.replace(some(), shapes={}), TrainingConfig(shape="sandwich"))
