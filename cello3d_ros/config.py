@@ -139,7 +139,13 @@ class TrainingConfig(Section):
     loss: str = _setting("log_det", "paper is the printed det F", choices=("log_det", "paper"))
     regularization: float = _setting(0.03, "lambda of lambda |Theta|^2", 0.0)
     mean_weight: float = _setting(0.15, "share of the training mean in a prediction", 0.0, 1.0)
-    max_iterations: int = _setting(100, "optimiser steps", 1)
+    optimizer: str = _setting(
+        "lbfgs", "what searches Theta; sgd is the paper's", choices=("lbfgs", "sgd")
+    )
+    learning_rate: float = _setting(
+        1e-5, "of sgd: Theta goes down this times each pair's gradient", 1e-12
+    )
+    max_iterations: int = _setting(100, "optimiser steps; of sgd, passes over all pairs", 1)
     seed: int = _setting(0, "seed of the initial Theta", 0)
 
 
