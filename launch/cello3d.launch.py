@@ -46,7 +46,7 @@ def actions(context):
             package="cello3d_ros",
             executable="covariance_node",
             name=given["name"],
-            namespace=given["namespace"],
+            namespace=given["namespace"] or None,
             output="screen",
             parameters=parameters,
             remappings=[(name, given[name]) for name in TOPICS],
