@@ -28,6 +28,7 @@ from cello3d_ros.ros.pairing import Frame, Link, Map, makes_keyframe
 METHOD_OF = {"cello3d": "model"} | {name: name for name in METHODS}
 
 _ORIGIN = np.eye(4)
+_MAX_TURN2_RAD2 = 3.0  # one radian about each axis
 
 
 class NotConvergedError(RegistrationError):
@@ -299,8 +300,14 @@ def _broken(before: Place, now: Place) -> str:
 
 
 def _extended(T: Array, Y: Array, T_step: Array, Y_step: Array) -> tuple[Array, Array]:
-    """Return the chain one step longer: 4th order, 2nd where the 4th is not positive definite."""
-    longer = compound_right(T, Y, T_step, Y_step, order=4)
-    if not is_positive_definite(longer.Y):
-        longer = compound_right(T, Y, T_step, Y_step, order=2)
+    """Return the chain one step longer: 4th order, 2nd where the 4th means nothing.
+
+    That is where its result is not positive definite, or rotations are hardly known: the terms of
+    4th order multiply variances, and would from a radian on make a chain grow without bound.
+    """
+    if max(np.trace(Y[3:, 3:]), np.trace(Y_step[3:, 3:])) <= _MAX_TURN2_RAD2:
+        longer = compound_right(T, Y, T_step, Y_step, order=4)
+        if is_positive_definite(longer.Y):
+            return longer.T, longer.Y
+    longer = compound_right(T, Y, T_step, Y_step, order=2)
     return longer.T, longer.Y
