@@ -31,7 +31,6 @@ class Robot:
         self.rng = np.random.default_rng(1)
         self.stamp_ns = 10**18
         self.n = 0
-        self.lie = np.eye(4)  # by which its odometry is off
 
     def pose(self) -> np.ndarray:
         """Where the robot is now."""
@@ -63,7 +62,7 @@ class Robot:
     def send(self, cloud: Any, odometry: bool = True, timeout_s: float = 10.0) -> dict[str, str]:
         """Send points or a whole message stamped now; return what diagnostics say of it."""
         if odometry:
-            self.player.publish_odometry(self.stamp_ns, self.lie @ self.pose())
+            self.player.publish_odometry(self.stamp_ns, self.pose())
         if isinstance(cloud, np.ndarray):
             self.player.publish_cloud(self.stamp_ns, cloud)
         else:
