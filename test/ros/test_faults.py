@@ -64,6 +64,20 @@ def test_parameters_that_change_under_load(robot, change, ask) -> None:
     robot.assert_right_again()
 
 
+def test_the_newest_cloud_is_next_when_many_came_during_long_work(robot) -> None:
+    """Each with its odometry, which waits in a queue of its own."""
+    player = robot.player
+    stamps = []
+    for n_points in (800_000, *[4000] * 9):
+        robot.step()
+        stamps.append(robot.stamp_ns)
+        player.publish_odometry(robot.stamp_ns, robot.pose())
+        player.publish_cloud(robot.stamp_ns, robot.points(n_points))
+    assert robot.settled()["last_event"] == "answered"
+    assert [ns for ns in stamps[1:] if ns in player.replay.relative] == stamps[-1:]
+    robot.assert_right_again()
+
+
 PUBLISHER = """
 import sys
 from cello3d_ros.ros.replay import Player
