@@ -55,13 +55,14 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        (f"share/{NAME}/config", glob("config/*")),
+        (f"share/{NAME}/config", glob("config/*.*")),
+        (f"share/{NAME}/config/examples", glob("config/examples/*")),
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
         (f"share/{NAME}/rviz", glob("rviz/*.rviz")),
     ],
     entry_points={
         "console_scripts": [
-            "covariance_node = cello3d_ros.ros.node:main",
+            "covariance_node = cello3d_ros.ros.main:main",
             "cello3d = cello3d_ros.cli.main:main",
         ]
     },

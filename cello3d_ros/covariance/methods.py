@@ -1,13 +1,13 @@
 """Every way to the covariance of a registration behind one interface, by name.
 
-A method takes ``(reading, reference, T_hat, pipeline, model, rng, settings)`` and returns a (6, 6)
-positive definite covariance, reading side, ordered (u, omega).  T_hat: (4, 4), the T_ref_read that
-ICP reported.  The model's ``sampling`` says how starts scatter.  RegistrationError, NoOverlapError
-or ModelError say that a method has no answer.
+A method takes a ``Pair``, which was described once for all of them, and returns a (6, 6) positive
+definite covariance of its registration, reading side, ordered (u, omega).  The model's
+``sampling`` says how starts scatter.  RegistrationError or ModelError: a method has no answer.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,31 +15,43 @@ import numpy as np
 
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import Pipeline
-from cello3d_ros.covariance.closed_form import ClosedForm, censi, closed_form
-from cello3d_ros.covariance.estimator import describe
+from cello3d_ros.covariance.closed_form import censi
+from cello3d_ros.covariance.description import Description
 from cello3d_ros.covariance.fused import fused, monte_carlo, registrations
-from cello3d_ros.covariance.model import Model, predict
+from cello3d_ros.covariance.model import Model, Prediction, predict
 from cello3d_ros.covariance.sigma_points import sigma_points
 from cello3d_ros.errors import ModelError, RegistrationError
 from cello3d_ros.geometry.gaussian import is_positive_definite, matrix_sqrt, symmetrized
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.registration.overlap import find_overlap
+from cello3d_ros.registration.icp import Registration
+
+
+class Pair(NamedTuple):
+    """Two clouds, how they were registered, and the description of that."""
+
+    reading: Cloud
+    reference: Cloud
+    registration: Registration
+    description: Description
 
 
 class MethodSettings(NamedTuple):
-    """What the baselines assume.
+    """What methods assume and what is made of their answers.
 
     sigma_m: deviation of the sensor's noise along each axis; n_registrations: extra runs of ICP
-    by ``monte_carlo`` and ``fused``.
+    by ``monte_carlo`` and ``fused``.  What ``estimate`` makes of any answer: rho_limit, the
+    ``nearest_rho`` beyond which the pair is unlike all examples; widen_unknown, whether it is
+    then widened to their mean; scale, a factor for every covariance.
     """
 
     sigma_m: float = 0.01
     n_registrations: int = 12
+    rho_limit: float = math.inf
+    widen_unknown: bool = False
+    scale: float = 1.0
 
 
-Method = Callable[
-    [Cloud, Cloud, Array, Pipeline, Model, np.random.Generator, MethodSettings], Array
-]
+Method = Callable[[Pair, Pipeline, Model, np.random.Generator, MethodSettings], Array]
 
 
 def extra_runs(name: str, settings: MethodSettings) -> int:
@@ -49,23 +61,18 @@ def extra_runs(name: str, settings: MethodSettings) -> int:
 
 
 def by_model(
-    reading: Cloud,
-    reference: Cloud,
-    T_hat: Array,
+    pair: Pair,
     pipeline: Pipeline,
     model: Model,
     rng: np.random.Generator,
     settings: MethodSettings,
 ) -> Array:
     """Return the model's prediction."""
-    pair = describe(reading, reference, T_hat, pipeline)
-    return predict(model, pair.descriptors[0], pair.shapes.get(model.shape)).covariance
+    return predicted(pair, model).covariance
 
 
 def by_constant(
-    reading: Cloud,
-    reference: Cloud,
-    T_hat: Array,
+    pair: Pair,
     pipeline: Pipeline,
     model: Model,
     rng: np.random.Generator,
@@ -75,65 +82,52 @@ def by_constant(
     mean = mean_example(model)
     if model.shape == "none":
         return mean
-    shape = getattr(_closed_form(reading, reference, T_hat, pipeline), model.shape)
-    root = matrix_sqrt(shape)
+    root = matrix_sqrt(pair.description.shapes[model.shape])
     return symmetrized(root @ mean @ root)
 
 
 def by_hessian(
-    reading: Cloud,
-    reference: Cloud,
-    T_hat: Array,
+    pair: Pair,
     pipeline: Pipeline,
     model: Model,
     rng: np.random.Generator,
     settings: MethodSettings,
 ) -> Array:
     """Return ``sigma^2 H^-1``."""
-    return settings.sigma_m**2 * _closed_form(reading, reference, T_hat, pipeline).hessian
+    return settings.sigma_m**2 * pair.description.shapes["hessian"]
 
 
 def by_sandwich(
-    reading: Cloud,
-    reference: Cloud,
-    T_hat: Array,
+    pair: Pair,
     pipeline: Pipeline,
     model: Model,
     rng: np.random.Generator,
     settings: MethodSettings,
 ) -> Array:
     """Return ``H^-1 (sum g g^T) H^-1``."""
-    return _closed_form(reading, reference, T_hat, pipeline).sandwich
+    return pair.description.shapes["sandwich"]
 
 
 def by_censi(
-    reading: Cloud,
-    reference: Cloud,
-    T_hat: Array,
+    pair: Pair,
     pipeline: Pipeline,
     model: Model,
     rng: np.random.Generator,
     settings: MethodSettings,
 ) -> Array:
     """Return ``censi`` of ``closed_form``."""
-    found = find_overlap(
-        reading, reference, T_hat, pipeline.overlap.radius_m, pipeline.icp.n_neighbors
-    )
+    found = pair.description.overlap
+    T_hat = pair.registration.T_ref_read
     return censi(
-        reading,
-        reference,
-        T_hat,
-        found.distances2,
-        found.indices,
+        *(pair.reading, pair.reference, T_hat),
+        *(found.distances2, found.indices),
         pipeline.icp,
         settings.sigma_m,
     )
 
 
 def by_sigma_points(
-    reading: Cloud,
-    reference: Cloud,
-    T_hat: Array,
+    pair: Pair,
     pipeline: Pipeline,
     model: Model,
     rng: np.random.Generator,
@@ -141,45 +135,47 @@ def by_sigma_points(
 ) -> Array:
     """Return ``sigma_points`` for starts that scatter like those of the training."""
     prior = model.sampling.variance * np.eye(6)
-    return sigma_points(reading, reference, T_hat, pipeline, prior, settings.sigma_m, rng)
+    return sigma_points(
+        *(pair.reading, pair.reference, pair.registration.T_ref_read),
+        pair.description.overlap,
+        pipeline,
+        prior,
+        settings.sigma_m,
+        rng,
+    )
 
 
 def by_monte_carlo(
-    reading: Cloud,
-    reference: Cloud,
-    T_hat: Array,
+    pair: Pair,
     pipeline: Pipeline,
     model: Model,
     rng: np.random.Generator,
     settings: MethodSettings,
 ) -> Array:
     """Return the covariance of a few registrations."""
-    n = settings.n_registrations
-    xi = registrations(reading, reference, T_hat, pipeline, model.sampling, n, rng)
+    xi = _online(pair, pipeline, model, rng, settings)
     if not is_positive_definite(Y := monte_carlo(xi)):
         raise RegistrationError(f"the covariance of {len(xi)} registrations is singular")
     return Y
 
 
 def by_fusion(
-    reading: Cloud,
-    reference: Cloud,
-    T_hat: Array,
+    pair: Pair,
     pipeline: Pipeline,
     model: Model,
     rng: np.random.Generator,
     settings: MethodSettings,
 ) -> Array:
     """Return the model's prediction, updated by a few registrations."""
-    F = by_model(reading, reference, T_hat, pipeline, model, rng, settings)
-    n = settings.n_registrations
-    return fused(F, registrations(reading, reference, T_hat, pipeline, model.sampling, n, rng))
+    return fused(predicted(pair, model).covariance, _online(pair, pipeline, model, rng, settings))
 
+
+DEFAULTS = MethodSettings()
 
 #: Methods by name.
 METHODS: dict[str, Method] = {
     "model": by_model,
-    "constant_relative": by_constant,
+    "constant": by_constant,
     "hessian": by_hessian,
     "sandwich": by_sandwich,
     "censi": by_censi,
@@ -200,7 +196,24 @@ def mean_example(model: Model) -> Array:
     return symmetrized(model.covariances[turns.index(0.0) :: len(turns)].mean(axis=0))
 
 
-def _closed_form(reading: Cloud, reference: Cloud, T_hat: Array, pipeline: Pipeline) -> ClosedForm:
-    icp = pipeline.icp
-    found = find_overlap(reading, reference, T_hat, pipeline.overlap.radius_m, icp.n_neighbors)
-    return closed_form(reading, reference, T_hat, found.distances2, found.indices, icp)
+def predicted(pair: Pair, model: Model) -> Prediction:
+    """Return the model's answer with the evidence for it."""
+    description = pair.description
+    return predict(model, description.descriptors[0], description.shapes.get(model.shape))
+
+
+def _online(
+    pair: Pair,
+    pipeline: Pipeline,
+    model: Model,
+    rng: np.random.Generator,
+    settings: MethodSettings,
+) -> Array:
+    """Return the errors of a few registrations about the pair's own.  (at most n, 6)."""
+    return registrations(
+        *(pair.reading, pair.reference, pair.registration.T_ref_read),
+        pipeline,
+        model.sampling,
+        settings.n_registrations,
+        rng,
+    )

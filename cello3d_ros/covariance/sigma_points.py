@@ -11,7 +11,7 @@ from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import symmetrized
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log
 from cello3d_ros.registration.backends import register_many
-from cello3d_ros.registration.overlap import find_overlap
+from cello3d_ros.registration.overlap import Overlap
 
 
 def offsets(prior: Array) -> Array:
@@ -24,6 +24,7 @@ def sigma_points(
     reading: Cloud,
     reference: Cloud,
     T_hat: Array,
+    overlap: Overlap,
     pipeline: Pipeline,
     prior: Array,
     sigma_m: float,
@@ -31,26 +32,30 @@ def sigma_points(
 ) -> Array:
     """Return ``1/12 sum xi xi^T + sigma^2 (2 H^-1 + 2 b b^T)``.  (6, 6), reading side.
 
-    xi = log(T_hat^-1 T_i), T_i the result of ICP started from ``T_hat exp(offset_i)``; prior:
-    (6, 6), covariance of the starts; H^-1 and b as in ``closed_form`` and ``common_bias``; starts
-    without an answer are left out.  12 runs of ICP, each with subsamples of its own.
+    xi = log(T_hat^-1 T_i), T_i the result of ICP started from ``T_hat exp(offset_i)``; overlap:
+    the associations at T_hat; prior: (6, 6), covariance of the starts; H^-1 and b as in
+    ``closed_form`` and ``common_bias``; starts without an answer are left out.  12 runs of ICP,
+    each with subsamples of its own.
     Source: Brossard, Bonnabel, Barrau 2020.
     """
     xi = registered_from(reading, reference, T_hat, offsets(prior), pipeline, rng)
     if len(xi) == 0:
         raise RegistrationError("ICP has no answer from any sigma point")
     return symmetrized(
-        xi.T @ xi / len(xi) + sensor_term(reading, reference, T_hat, pipeline, sigma_m)
+        xi.T @ xi / len(xi) + sensor_term(reading, reference, T_hat, overlap, pipeline, sigma_m)
     )
 
 
 def sensor_term(
-    reading: Cloud, reference: Cloud, T_hat: Array, pipeline: Pipeline, sigma_m: float
+    reading: Cloud,
+    reference: Cloud,
+    T_hat: Array,
+    overlap: Overlap,
+    pipeline: Pipeline,
+    sigma_m: float,
 ) -> Array:
     """Return ``sigma^2 (2 H^-1 + 2 b b^T)``: independent noise and a common bias, two clouds."""
-    icp = pipeline.icp
-    overlap = find_overlap(reading, reference, T_hat, pipeline.overlap.radius_m, icp.n_neighbors)
-    found = (overlap.distances2, overlap.indices, icp)
+    found = (overlap.distances2, overlap.indices, pipeline.icp)
     b = common_bias(reading, reference, T_hat, *found)
     inverse_H = closed_form(reading, reference, T_hat, *found).hessian
     return np.asarray(2.0 * sigma_m**2 * (inverse_H + np.outer(b, b)))

@@ -93,7 +93,7 @@ def from_dataset(
     covariances = {
         BASELINE: np.tile(mean, (n, 1, 1)),
         "model": np.array(F),
-        "constant_relative": to_absolute(constant, examples, model.shape),
+        "constant": to_absolute(constant, examples, model.shape),
     }
     if "hessian" in examples.shapes:
         covariances["hessian"] = settings.sigma_m**2 * examples.shapes["hessian"]

@@ -32,7 +32,7 @@ def evaluate(
     """Judge the model and two constants on the targets of ``problem``.
 
     mean_covariance is the mean of the absolute covariances (the paper's baseline), of other
-    recordings as they were recorded; constant_relative is that of the relative ones.
+    recordings as they were recorded; constant is that of the relative ones.
     """
     relative = to_relative(examples, config.shape)
     names = np.unique(targets.groups)
@@ -44,7 +44,7 @@ def evaluate(
     F = {
         "model": to_absolute(predicted(theta, problem), targets, config.shape),
         "mean_covariance": np.array([absolute_means[name] for name in targets.groups]),
-        "constant_relative": to_absolute(constant, targets, config.shape),
+        "constant": to_absolute(constant, targets, config.shape),
     }
     return {name: measure(Fs, targets) for name, Fs in F.items()}
 

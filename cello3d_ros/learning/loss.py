@@ -17,16 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from cello3d_ros.config import TrainingConfig
+from cello3d_ros.geometry.packed import TWICE, pack, unpack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.examples import (
-    TWICE,
     Examples,
     Indices,
     flat_features,
-    pack,
     to_relative,
     turn,
-    unpack,
     unturned_rows,
 )
 
@@ -95,6 +93,12 @@ def select_features(problem: Problem, active: Indices) -> Problem:
         X=np.ascontiguousarray(problem.X[:, active]),
         X_examples=np.ascontiguousarray(problem.X_examples[:, active]),
     )
+
+
+def select_targets(problem: Problem, rows: Indices) -> Problem:
+    """Return the problem of predicting some of the targets, from all examples."""
+    chosen = {name: getattr(problem, name)[rows] for name in ("X", "Y", "groups", "means")}
+    return dataclasses.replace(problem, **chosen)
 
 
 def expand_features(theta: Array, active: Indices, n_features: int) -> Array:

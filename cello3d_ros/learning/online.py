@@ -10,7 +10,8 @@ import numpy as np
 
 from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import Pipeline
-from cello3d_ros.covariance.methods import METHODS, MethodSettings
+from cello3d_ros.covariance.description import describe
+from cello3d_ros.covariance.methods import METHODS, MethodSettings, Pair
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import CloudError, ModelError, RecordingError, RegistrationError
 from cello3d_ros.geometry.gaussian import is_positive_definite
@@ -23,7 +24,7 @@ class Answer(NamedTuple):
     """What one method said of one pair.
 
     covariance: (6, 6), NaN where there is no answer; cpu_ms: processor time, on top of the
-    registration that is judged.
+    registration that is judged, with the description of the pair, which methods share.
     """
 
     covariance: Array
@@ -73,11 +74,15 @@ def answers(
     def every(i: int, j: int) -> dict[str, Answer]:
         rng = np.random.default_rng([seed, i, j])
         T_mean = inverse(poses[i]) @ poses[j]
-        T_hat = register(clouds[j], clouds[i], T_mean, model.pipeline.icp, rng).T_ref_read
-        return {
-            name: _answer(name, clouds[j], clouds[i], T_hat, model, rng, settings)
-            for name in METHODS
-        }
+        found = register(clouds[j], clouds[i], T_mean, model.pipeline.icp, rng)
+        start = time.process_time()
+        try:
+            description = describe(clouds[j], clouds[i], found.T_ref_read, model.pipeline)
+        except RegistrationError:
+            return {name: Answer(np.full((6, 6), np.nan), np.nan) for name in METHODS}
+        pair = Pair(clouds[j], clouds[i], found, description)
+        ms = 1e3 * (time.process_time() - start)
+        return {name: _answer(name, pair, ms, model, rng, settings) for name in METHODS}
 
     for ij in pairs[:1]:
         every(*ij)  # compiles what there is to compile, so that the times below are without it
@@ -87,17 +92,16 @@ def answers(
 
 def _answer(
     name: str,
-    reading: Cloud,
-    reference: Cloud,
-    T_hat: Array,
+    pair: Pair,
+    described_ms: float,
     model: Model,
     rng: np.random.Generator,
     settings: MethodSettings,
 ) -> Answer:
     start = time.process_time()
     try:
-        Y = METHODS[name](reading, reference, T_hat, model.pipeline, model, rng, settings)
+        Y = METHODS[name](pair, model.pipeline, model, rng, settings)
     except (RegistrationError, ModelError):
         Y = np.full((6, 6), np.nan)
-    cpu_ms = 1e3 * (time.process_time() - start)
+    cpu_ms = described_ms + 1e3 * (time.process_time() - start)
     return Answer(Y if is_positive_definite(Y) else np.full((6, 6), np.nan), cpu_ms)

@@ -18,7 +18,7 @@ import numpy as np
 
 from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import Pipeline, SamplingConfig
-from cello3d_ros.covariance.estimator import describe
+from cello3d_ros.covariance.description import describe
 from cello3d_ros.errors import CloudError, NoOverlapError, RecordingError, RegistrationError
 from cello3d_ros.geometry.gaussian import is_positive_definite, sampled_covariance
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log

@@ -19,7 +19,7 @@ from cello3d_ros.registration.icp import Registration
 METHODS = {
     "mean_covariance",
     "model",
-    "constant_relative",
+    "constant",
     "hessian",
     "hessian_scaled",
     "sandwich",
@@ -107,7 +107,7 @@ def test_figures_are_written_and_printed(folder: Path, capsys: pytest.CaptureFix
     assert "with_flagged_pairs" not in report
     printed = capsys.readouterr().out
     assert "walk (2 pairs)" in printed
-    assert "constant relative" in printed
+    assert "constant" in printed
     assert sorted(path.name for path in folder.iterdir()) == ["e.json", "model.npz", "set"]
 
 

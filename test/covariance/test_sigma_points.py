@@ -13,6 +13,7 @@ from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import is_positive_definite
 from cello3d_ros.geometry.se3 import exp, inverse, transform
 from cello3d_ros.registration.icp import Registration
+from cello3d_ros.registration.overlap import find_overlap
 
 T_HAT = exp([0.4, -0.3, 0.05, 0.02, 0.05, 0.6])
 
@@ -27,6 +28,10 @@ def pair(room):
     rng = np.random.default_rng(33)
     reading = prepare(transform(inverse(T_HAT), room[0]), CloudConfig(), rng)
     return reading, prepare(room[1], CloudConfig(), rng)
+
+
+def overlap(pair):
+    return find_overlap(*pair, T_HAT, 0.3, Pipeline().icp.n_neighbors)
 
 
 def pretend(monkeypatch, answer):
@@ -55,23 +60,27 @@ def test_the_sensor_term_is_that_of_two_clouds_and_a_common_bias(pair):
     b = common_bias(reading, reference, T_HAT, *found, icp)
     H_inverse = closed_form(reading, reference, T_HAT, *found, icp).hessian
     expected = 0.03**2 * (2 * H_inverse + 2 * np.outer(b, b))
-    np.testing.assert_allclose(sensor_term(*pair, T_HAT, Pipeline(), 0.03), expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        sensor_term(*pair, T_HAT, overlap(pair), Pipeline(), 0.03), expected, rtol=1e-9
+    )
     assert np.abs(np.outer(b, b)).max() > H_inverse.max()
 
 
 def test_an_icp_that_stays_put_gives_the_prior_and_the_sensor_term(pair, monkeypatch):
     pretend(monkeypatch, lambda T: (T, ""))
     rng, prior = np.random.default_rng(0), some_prior()
-    Y = sigma_points(*pair, T_HAT, Pipeline(), prior, 0.01, rng)
-    expected = prior + sensor_term(*pair, T_HAT, Pipeline(), 0.01)
+    Y = sigma_points(*pair, T_HAT, overlap(pair), Pipeline(), prior, 0.01, rng)
+    expected = prior + sensor_term(*pair, T_HAT, overlap(pair), Pipeline(), 0.01)
     np.testing.assert_allclose(Y, expected, atol=1e-12)
 
 
 def test_an_icp_that_always_comes_back_leaves_the_sensor_term(pair, monkeypatch):
     pretend(monkeypatch, lambda T: (T_HAT, "max_iterations"))
     rng = np.random.default_rng(0)
-    Y = sigma_points(*pair, T_HAT, Pipeline(), some_prior(), 0.03, rng)
-    np.testing.assert_allclose(Y, 9.0 * sensor_term(*pair, T_HAT, Pipeline(), 0.01), rtol=1e-6)
+    Y = sigma_points(*pair, T_HAT, overlap(pair), Pipeline(), some_prior(), 0.03, rng)
+    np.testing.assert_allclose(
+        Y, 9.0 * sensor_term(*pair, T_HAT, overlap(pair), Pipeline(), 0.01), rtol=1e-6
+    )
     assert is_positive_definite(Y)
 
 
@@ -80,17 +89,19 @@ def test_starts_without_an_answer_do_not_count(pair, monkeypatch):
     answers = iter([(away, ""), *[(np.full((4, 4), 7.0), "singular")] * 11])
     pretend(monkeypatch, lambda T: next(answers))
     rng = np.random.default_rng(0)
-    Y = sigma_points(*pair, T_HAT, Pipeline(), some_prior(), 0.01, rng)
-    expected = sensor_term(*pair, T_HAT, Pipeline(), 0.01)
+    Y = sigma_points(*pair, T_HAT, overlap(pair), Pipeline(), some_prior(), 0.01, rng)
+    expected = sensor_term(*pair, T_HAT, overlap(pair), Pipeline(), 0.01)
     expected[0, 0] += 0.01
     np.testing.assert_allclose(Y, expected, atol=1e-9)
     pretend(monkeypatch, lambda T: (T, "singular"))
     with pytest.raises(RegistrationError, match="no answer"):
-        sigma_points(*pair, T_HAT, Pipeline(), some_prior(), 0.01, rng)
+        sigma_points(*pair, T_HAT, overlap(pair), Pipeline(), some_prior(), 0.01, rng)
 
 
 def test_in_a_room_most_starts_come_back(pair):
     prior = 1e-3 * np.eye(6)
-    Y = sigma_points(*pair, T_HAT, Pipeline(), prior, 0.01, np.random.default_rng(5))
+    Y = sigma_points(
+        *pair, T_HAT, overlap(pair), Pipeline(), prior, 0.01, np.random.default_rng(5)
+    )
     assert is_positive_definite(Y)
     assert np.trace(Y) < 0.1 * np.trace(prior)

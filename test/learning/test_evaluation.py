@@ -163,7 +163,7 @@ def test_methods_from_a_dataset():
     found = from_dataset(model, targets, np.diag(SIZES**2), settings)
     report = compare(found, targets, np.ones(8, np.bool_), settings)
     methods = report["methods"]
-    for name in ("model", "constant_relative", "hessian", "hessian_scaled", "sandwich_scaled"):
+    for name in ("model", "constant", "hessian", "hessian_scaled", "sandwich_scaled"):
         assert methods[name]["kl_mean"] == pytest.approx(0.0, abs=1e-9), name
     assert methods["sandwich"]["dm2_over_6"] == pytest.approx(4.0)
     assert methods["sandwich_scaled"]["scale"] == pytest.approx(4.0)
@@ -229,7 +229,7 @@ def test_a_dataset_without_the_models_shape_is_refused():
     settings = MethodSettings()
     absolute = from_dataset(constant_model(np.eye(6), 3), targets, np.eye(6), settings)
     methods = compare(absolute, targets, np.ones(8, np.bool_), settings)["methods"]
-    assert set(methods) == {"mean_covariance", "model", "constant_relative"}
+    assert set(methods) == {"mean_covariance", "model", "constant"}
 
 
 def test_the_baseline_is_the_mean_of_the_training_recordings(tmp_path):

@@ -1,0 +1,98 @@
+"""What every method is told of a registered pair: found once, from the clouds and the pose."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cello3d_ros.clouds.shape import Cloud
+from cello3d_ros.config import Pipeline
+from cello3d_ros.covariance.closed_form import closed_form
+from cello3d_ros.covariance.descriptor import describe_overlap
+from cello3d_ros.errors import NoOverlapError
+from cello3d_ros.geometry.se3 import Array, inverse, transform
+from cello3d_ros.registration.overlap import Overlap, find_overlap
+
+
+class Description(NamedTuple):
+    """A registered pair as methods and models see it, whoever registered it.
+
+    n_overlap: overlapping points of both clouds; overlap_ratio: share of the reading's points;
+    descriptors: (n_rotations, n_features), the k-th after a turn of the reading frame by
+    2 pi k / n_rotations about z; shapes: cheap predictors by name, each (6, 6), reading side;
+    overlap: the associations that all of it comes from.
+    """
+
+    n_overlap: int
+    overlap_ratio: float
+    descriptors: Array
+    shapes: dict[str, Array]
+    overlap: Overlap
+
+
+def describe(
+    reading: Cloud, reference: Cloud, T_ref_read: Array, pipeline: Pipeline, n_rotations: int = 1
+) -> Description:
+    """Describe a registered pair.
+
+    T_ref_read: (4, 4).  Raises NoOverlapError when too little overlaps and RegistrationError
+    when the geometry leaves a direction free.
+    """
+    overlap = find_overlap(
+        reading, reference, T_ref_read, pipeline.overlap.radius_m, pipeline.icp.n_neighbors
+    )
+    _check_overlap(overlap, pipeline)
+    shapes = closed_form(
+        reading, reference, T_ref_read, overlap.distances2, overlap.indices, pipeline.icp
+    )._asdict()
+    descriptors = _descriptors(reading, reference, T_ref_read, overlap, pipeline, n_rotations)
+    return Description(overlap.n_points, overlap.ratio, descriptors, shapes, overlap)
+
+
+def turns(n_rotations: int) -> Array:
+    """Return the rotations about z by 2 pi k / n_rotations.  (n_rotations, 3, 3)."""
+    angles = 2.0 * np.pi * np.arange(n_rotations) / n_rotations
+    R = np.zeros((n_rotations, 3, 3))
+    R[:, 0, 0] = R[:, 1, 1] = np.cos(angles)
+    R[:, 1, 0] = np.sin(angles)
+    R[:, 0, 1] = -R[:, 1, 0]
+    R[:, 2, 2] = 1.0
+    return R
+
+
+def _check_overlap(overlap: Overlap, pipeline: Pipeline) -> None:
+    if overlap.n_points < pipeline.overlap.min_points:
+        raise NoOverlapError(
+            f"{overlap.n_points} overlapping points, need {pipeline.overlap.min_points}"
+        )
+    if overlap.ratio < pipeline.overlap.min_ratio:
+        raise NoOverlapError(
+            f"{overlap.ratio:.1%} of the reading overlaps the reference, need "
+            f"{pipeline.overlap.min_ratio:.1%}"
+        )
+
+
+def _descriptors(
+    reading: Cloud,
+    reference: Cloud,
+    T_ref_read: Array,
+    overlap: Overlap,
+    pipeline: Pipeline,
+    n_rotations: int,
+) -> Array:
+    """Return the descriptor of the overlap after each turn.  (n_rotations, n_features)."""
+    P, Q = overlap.reading, overlap.reference
+    T_read_ref = inverse(T_ref_read)
+    points = np.vstack([reading.points[P], transform(T_read_ref, reference.points[Q])])
+    normals = np.vstack([reading.normals[P], reference.normals[Q] @ T_read_ref[:3, :3].T])
+    planarity = np.concatenate([reading.planarity[P], reference.planarity[Q]])
+    cylindricality = np.concatenate([reading.cylindricality[P], reference.cylindricality[Q]])
+    return np.array(
+        [
+            describe_overlap(
+                points @ Rz.T, normals @ Rz.T, planarity, cylindricality, pipeline.grid
+            )
+            for Rz in turns(n_rotations)
+        ]
+    )
