@@ -45,15 +45,16 @@ def estimate(
     method: str = "model",
     settings: MethodSettings = DEFAULTS,
     registration: Registration | None = None,
+    n_threads: int = 1,
 ) -> Estimate:
     """Register two clouds and find the covariance of the result.
 
     T_init: (4, 4), the first guess of T_ref_read.  method: a name of ``METHODS``.  registration:
     the result of whoever registered the clouds (``registered_elsewhere``); ICP is then not run
-    and T_init not looked at.  A registration that reached its last iteration is returned with
-    ``converged`` False: its covariance says little.  Raises RegistrationError when ICP or the
-    method has no answer, NoOverlapError when the clouds share too little and ModelError when the
-    grid is not the model's.
+    and T_init not looked at.  n_threads changes no result.  A registration that reached its last
+    iteration is returned with ``converged`` False: its covariance says little.  Raises
+    RegistrationError when ICP or the method has no answer, NoOverlapError when the clouds share
+    too little and ModelError when the grid is not the model's.
     """
     if pipeline.grid != model.pipeline.grid:
         raise ModelError(f"the model was trained with {model.pipeline.grid}, not {pipeline.grid}")
@@ -61,7 +62,8 @@ def estimate(
         registration = register(reading, reference, T_init, pipeline.icp, rng)
     if registration.reason not in ("", "max_iterations"):
         raise RegistrationError(f"ICP has no answer: {registration.reason.replace('_', ' ')}")
-    description = describe(reading, reference, registration.T_ref_read, pipeline)
+    T_ref_read = registration.T_ref_read
+    description = describe(reading, reference, T_ref_read, pipeline, n_threads=n_threads)
     pair = Pair(reading, reference, registration, description)
     prediction = predicted(pair, model)
     Y = prediction.covariance

@@ -6,6 +6,7 @@ decided here; registration and covariance are one call of the estimator.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +30,7 @@ METHOD_OF = {"cello3d": "model"} | {name: name for name in METHODS}
 
 _ORIGIN = np.eye(4)
 _MAX_TURN2_RAD2 = 3.0  # one radian about each axis
+_N_THREADS = min(os.cpu_count() or 1, 4)  # more than that is not worth starting
 
 
 class NotConvergedError(RegistrationError):
@@ -112,7 +114,7 @@ class Tracker:
         against it; then the chain starts again at the last of them.
         """
         rng = np.random.default_rng([self.config.seed, stamp_ns & (2**64 - 1)])
-        cloud = prepare(points, self.pipeline.cloud, rng)
+        cloud = prepare(points, self.pipeline.cloud, rng, _N_THREADS)
         frame = Frame(stamp_ns, cloud, place, place.T_odom_sensor)
         if self._latest is not None:
             frame = self._in_chain(frame, self._latest.frame)
@@ -180,6 +182,7 @@ class Tracker:
             method=METHOD_OF[self.config.covariance_mode],
             settings=self._settings(),
             registration=registered_elsewhere(T_init) if guess == EXTERNAL else None,
+            n_threads=_N_THREADS,
         )
         if not found.registration.converged:
             raise NotConvergedError(
