@@ -61,7 +61,7 @@ setup(
     ],
     entry_points={
         "console_scripts": [
-            "covariance_node = cello3d_ros.ros.node:main",
+            "covariance_node = cello3d_ros.ros.main:main",
             "cello3d = cello3d_ros.cli.main:main",
         ]
     },

@@ -148,6 +148,7 @@ class NodeConfig(Section):
     """What only the node needs."""
 
     model: str = _setting("", "model file; empty is the shipped one")
+    autostart: bool = _setting(True, "configure and activate at once; false waits to be told")
     T_base_sensor: tuple[float, ...] = _setting(
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
         "sensor in the odometry's child frame: x y z qx qy qz qw",

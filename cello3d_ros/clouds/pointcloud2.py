@@ -92,7 +92,6 @@ def _records(message: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
         raise CloudError(f"PointCloud2 declares {declared} bytes but holds {data.size}")
     if row_step == row:
         return data[:declared].view(dtype)
-    if data.size < height * row_step:  # the last row may come without its padding
-        data = np.concatenate([data, np.zeros(height * row_step - data.size, np.uint8)])
-    rows = data[: height * row_step].reshape(height, row_step)[:, :row]
-    return np.ascontiguousarray(rows).reshape(-1).view(dtype)
+    last = (height - 1) * row_step  # the last row may come without its padding
+    rows = data[:last].reshape(height - 1, row_step)[:, :row]
+    return np.concatenate([rows.reshape(-1), data[last:declared]]).view(dtype)

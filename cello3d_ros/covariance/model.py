@@ -31,8 +31,10 @@ from cello3d_ros.config import (
     pipeline_of,
 )
 from cello3d_ros.covariance.archive import read_arrays, write_arrays
+from cello3d_ros.covariance.sums import squared_distances, weighted_sum
 from cello3d_ros.errors import ConfigError, ModelError
 from cello3d_ros.geometry.gaussian import is_positive_definite, matrix_sqrt, symmetrized
+from cello3d_ros.geometry.packed import pack, unpack
 from cello3d_ros.geometry.se3 import Array
 
 FORMAT = "cello3d-model"
@@ -46,6 +48,7 @@ CONVENTIONS = {
 SHAPES = ("none", "hessian", "sandwich")
 
 _MAX_HEADER_BYTES = 16 * 1024**2
+_BLOCK = 65536  # covariances checked at once, bounds memory
 _ARRAYS = ("theta", "mean", "scale", "projections", "covariances")
 
 
@@ -82,8 +85,10 @@ class Model:
         _check_settings(self)
         for name in ("mean_weight", "cutoff_rho"):
             object.__setattr__(self, name, _number(name, getattr(self, name)))
-        if not (fine := is_positive_definite(self.covariances)).all():
-            raise ModelError(f"covariance {np.argmin(fine)} is not positive definite")
+        for start in range(0, len(self.covariances), _BLOCK):
+            fine = is_positive_definite(self.covariances[start : start + _BLOCK])
+            if not fine.all():
+                raise ModelError(f"covariance {start + np.argmin(fine)} is not positive definite")
 
     @property
     def n_examples(self) -> int:
@@ -99,6 +104,11 @@ class Model:
     def mean_covariance(self) -> Array:
         """Mean of the training covariances (relative ones if shape is not none).  (6, 6)."""
         return symmetrized(self.covariances.mean(axis=0))
+
+    @cached_property
+    def packed_covariances(self) -> Array:
+        """Upper triangles of the training covariances: fewer bytes to read.  (N, 21)."""
+        return pack(self.covariances)
 
 
 class Prediction(NamedTuple):
@@ -127,9 +137,12 @@ def weigh(rho: Array, cutoff_rho: float = math.inf) -> Array:
 
     The minimum is subtracted first, so that the nearest example weighs most and never 0/0.
     """
-    excess = rho - rho.min(axis=-1, keepdims=True)
-    w = np.where(excess <= cutoff_rho, np.exp(-excess), 0.0)
-    return np.asarray(w / w.sum(axis=-1, keepdims=True))
+    w = rho.min(axis=-1, keepdims=True) - rho
+    far = w < -cutoff_rho
+    np.exp(w, out=w)
+    w[far] = 0.0
+    w /= w.sum(axis=-1, keepdims=True)
+    return np.asarray(w)
 
 
 def predict(model: Model, descriptor: ArrayLike, S: ArrayLike | None = None) -> Prediction:
@@ -143,15 +156,13 @@ def predict(model: Model, descriptor: ArrayLike, S: ArrayLike | None = None) -> 
         raise ModelError(f"descriptor has shape {d.shape}, the model needs ({model.n_features},)")
     if not np.isfinite(d).all():
         raise ModelError("descriptor is not finite")
-    with np.errstate(over="ignore", invalid="ignore"):
-        offset = model.projections - project(d, model.theta, model.mean, model.scale)
-        rho = np.einsum("kr,kr->k", offset, offset)
+    rho = squared_distances(model.projections, project(d, model.theta, model.mean, model.scale))
     if not np.isfinite(nearest := float(rho.min())):
         raise ModelError("descriptor is too far from every example for a distance")
     w = weigh(rho, model.cutoff_rho)
-    F = (w @ model.covariances.reshape(-1, 36)).reshape(6, 6)
+    F = unpack(weighted_sum(w, model.packed_covariances))
     F = (1.0 - model.mean_weight) * F + model.mean_weight * model.mean_covariance
-    F = _scaled(symmetrized(F), S, model.shape)
+    F = _scaled(F, S, model.shape)
     return Prediction(F, nearest, float(1.0 / (w @ w)))
 
 

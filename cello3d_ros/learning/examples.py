@@ -1,7 +1,4 @@
-"""What a model is trained on: the accepted pairs of some recordings, and their turned copies.
-
-Covariances are packed as their upper triangles, 21 numbers, where many are summed.
-"""
+"""What a model is trained on: the accepted pairs of some recordings, and their turned copies."""
 
 from __future__ import annotations
 
@@ -23,11 +20,7 @@ Indices = NDArray[np.intp]
 
 # sampling settings in which datasets may differ
 _FREE = ("seed", "n_samples", "min_samples", "precision", "max_gap")
-_ROWS, _COLUMNS = np.triu_indices(6)
 _MAX_SAMPLES = 200  # errors of each pair kept for the coverage
-
-#: (21,) how often each packed number stands in its matrix: ``tr(A B) = (A * TWICE) @ B``, packed.
-TWICE: Array = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,18 +118,6 @@ def feature_scaler(examples: Examples) -> tuple[Array, Array, Indices]:
     mean, std = X.mean(axis=0), X.std(axis=0)
     varies = std > 1e-6 * (np.abs(mean) + 1e-6)
     return mean, np.where(varies, std, 1.0), np.flatnonzero(varies)
-
-
-def pack(Y: Array) -> Array:
-    """Return the upper triangles.  (..., 6, 6) -> (..., 21)."""
-    return np.ascontiguousarray(Y[..., _ROWS, _COLUMNS])
-
-
-def unpack(packed: Array) -> Array:
-    Y = np.empty((*packed.shape[:-1], 6, 6))
-    Y[..., _ROWS, _COLUMNS] = packed
-    Y[..., _COLUMNS, _ROWS] = packed
-    return Y
 
 
 def _check_alike(ours: Dataset, theirs: Dataset) -> None:

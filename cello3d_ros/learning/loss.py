@@ -17,16 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from cello3d_ros.config import TrainingConfig
+from cello3d_ros.geometry.packed import TWICE, pack, unpack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.examples import (
-    TWICE,
     Examples,
     Indices,
     flat_features,
-    pack,
     to_relative,
     turn,
-    unpack,
     unturned_rows,
 )
 

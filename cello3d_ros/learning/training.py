@@ -16,10 +16,11 @@ from scipy.optimize import minimize
 from cello3d_ros.config import TrainingConfig
 from cello3d_ros.covariance.model import Model, project
 from cello3d_ros.errors import DatasetError
+from cello3d_ros.geometry.packed import unpack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import package_versions
 from cello3d_ros.learning.evaluation import Figures, evaluate
-from cello3d_ros.learning.examples import Examples, feature_scaler, flat_features, unpack
+from cello3d_ros.learning.examples import Examples, feature_scaler, flat_features
 from cello3d_ros.learning.loss import (
     Problem,
     expand_features,

@@ -12,7 +12,7 @@ from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.ros.messages import time_of
 from cello3d_ros.ros.tracker import Answer
 
-ANSWERED, REFERENCE, WAITING = "answered", "reference", "waiting"
+ANSWERED, REFERENCE, WAITING, INACTIVE = "answered", "reference", "waiting", "inactive"
 
 _WINDOW = 200  # latencies remembered
 
@@ -27,10 +27,15 @@ class Statistics:
         self.dropped: Counter[str] = Counter()
         self._latencies_s: deque[float] = deque(maxlen=_WINDOW)
         self._ages_s: deque[float] = deque(maxlen=_WINDOW)
-        self._last_event, self._last_stamp_ns = WAITING, 0
+        self._last_event, self._last_stamp_ns = INACTIVE, 0
         self._last_failure = ""
         self._n_failed_in_a_row = 0
         self._answer: dict[str, str] = {}
+
+    def listen(self, is_listening: bool) -> None:
+        """Note that the node has begun, or ceased, to listen."""
+        self._last_event, self._last_stamp_ns = WAITING if is_listening else INACTIVE, 0
+        self._n_failed_in_a_row = 0
 
     def fail(self, stamp_ns: int, reason: str, sentence: str) -> None:
         """Count a cloud without an answer."""
@@ -53,7 +58,9 @@ class Statistics:
         self._ages_s.append(1e-9 * (now_ns - answer.stamp_ns))
         self._answer = _described(answer, C)
 
-    def message(self, name: str, now_ns: int, n_restarts: int) -> DiagnosticArray:
+    def message(
+        self, name: str, now_ns: int, n_restarts: int, n_clock_jumps: int
+    ) -> DiagnosticArray:
         """Return the message of now: level, one sentence, keys and values."""
         status = DiagnosticStatus(name=name, level=self._level(), message=self._sentence())
         values = {
@@ -66,7 +73,7 @@ class Statistics:
             **{f"dropped.{reason}": str(n) for reason, n in sorted(self.dropped.items())},
             "odometry_received": str(self.counts["odometry"]),
             "odometry_rejected": str(self.counts["odometry_rejected"]),
-            "clock_jumps": str(self.counts["clock_jumps"]),
+            "clock_jumps": str(n_clock_jumps),
             "chain_restarts": str(n_restarts),
             "model": self._model_name,
             **_quantiles("latency_ms", self._latencies_s),
@@ -91,6 +98,7 @@ class Statistics:
             return f"no answer: {self._last_failure}"
         return {
             WAITING: "waiting for clouds and odometry",
+            INACTIVE: "inactive: not listening",
             REFERENCE: "the next cloud is registered to this one",
         }.get(self._last_event, "answered")
 

@@ -62,12 +62,9 @@ class Intake:
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def clear(self) -> list[Skip]:
-        """Forget the clouds that wait: time has jumped."""
-        dropped = [
-            Skip(job.stamp_ns, "clock_jump", "time jumped back while it waited")
-            for job in self._waiting
-        ]
+    def clear(self, reason: str, sentence: str) -> list[Skip]:
+        """Forget the clouds that wait, for a reason."""
+        dropped = [Skip(job.stamp_ns, reason, sentence) for job in self._waiting]
         self._waiting.clear()
         return dropped
 

@@ -6,180 +6,155 @@ the frame of the cloud.  ``~/pose`` is the chain of them since its last restart,
 the odometry, where it starts without error at the odometry's pose; its errors accumulate and must
 not be fused as if they were independent.  Nothing is published for a cloud without an answer;
 ``/diagnostics`` says why.
+
+This module is the node's life and its wiring: configure loads and warms up, activate listens.
+What is heard goes to the worker (worker.py), its answers to the outputs (outputs.py).
 """
 
 from __future__ import annotations
 
-import contextlib
-import math
-import re
-import signal
-import sys
-import time
 import traceback
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.utilities import try_shutdown
 from sensor_msgs.msg import PointCloud2
-from threadpoolctl import threadpool_limits
+from std_srvs.srv import Trigger
 
-from cello3d_ros.clouds.pointcloud2 import read_points
 from cello3d_ros.config import PIPELINE, Config, differences
 from cello3d_ros.covariance.model import Model, load_model, shipped_model_path
-from cello3d_ros.errors import Cello3dError, CloudError, ConfigError
-from cello3d_ros.geometry import se3
-from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.ros import messages, parameters
+from cello3d_ros.errors import Cello3dError, ConfigError
+from cello3d_ros.ros import parameters
 from cello3d_ros.ros.diagnostics import Statistics
-from cello3d_ros.ros.intake import JUMP_NS, Intake, Job, Skip, stamp_order
-from cello3d_ros.ros.odometry import OdometryBuffer, OdometryError
-from cello3d_ros.ros.tracker import Answer, Tracker, reason_of
+from cello3d_ros.ros.intake import JUMP_NS, Job, Skip
+from cello3d_ros.ros.life import ManagedNode
+from cello3d_ros.ros.logbook import Logbook
+from cello3d_ros.ros.outputs import Outputs
+from cello3d_ros.ros.tracker import Answer, reason_of
 from cello3d_ros.ros.warmup import warm_up
-
-NAME = "covariance_node"
+from cello3d_ros.ros.worker import Worker
 
 _TICK_S = 0.05  # how often it is looked whether a cloud has waited too long
-_WARNING_PERIOD_S = 5.0  # warnings of one kind come at most this often
-_MAX_WARNINGS = 100  # kinds of warnings remembered
 
 
-class CovarianceNode(Node):
-    """Translates: messages in, one call of the estimator, messages out, errors to diagnostics."""
+class CovarianceNode(ManagedNode):
+    """Translates: messages in, one call of the worker, messages out, errors to diagnostics."""
 
-    def __init__(self) -> None:
-        """Load, check and warm up everything, then listen.  Raises Cello3dError."""
-        super().__init__(NAME)
-        path = Path(parameters.declare_model(self) or shipped_model_path())
-        model = load_model(path)
-        self.config = self._configured(model)
-        config = self.config.node
-        self._odometry = OdometryBuffer(config.odometry_buffer_s, config.odometry_gap_s)
-        self._odometry_frame = "odom"
-        self._T_base_sensor = se3.pose(config.T_base_sensor[:3], config.T_base_sensor[3:])
-        self._intake = Intake(self._odometry)
-        self._newest_cloud_ns: int | None = None
-        self._tracker = Tracker(model, self.config, config)
-        self._statistics = Statistics(path.name, config.max_failures)
-        self._warned_s: dict[str, float] = {}
+    def __init__(self, name: str) -> None:
+        """Join the graph, unconfigured.  Raises ConfigError for a parameter of a wrong type."""
+        super().__init__(name)
+        parameters.declare_first(self)
+        self._config: Config | None = None  # None: not configured
+        self._defaults: Config | None = None
+        self._logbook = Logbook(lambda sentence: self.get_logger().warning(sentence))
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._apply_parameters)
+
+    @property
+    def autostart(self) -> bool:
+        """Whether the process is to configure and activate the node by itself."""
+        return bool(self.get_parameter(parameters.AUTOSTART).value)
+
+    def configure(self) -> None:
+        """Load, check and warm up everything, then say what may be heard."""
+        path = Path(str(self.get_parameter(parameters.MODEL).value) or shipped_model_path())
+        self._model = load_model(path)
+        config = self._declared(self._model)
         self.get_logger().info("warming up; a first start compiles the kernels")
-        warm_up(model, self.config)
-        self._connect()
-        self.get_logger().info(
-            f"ready: model {path.name} of {model.n_examples} examples, listening to "
-            f"{self.resolve_topic_name('points')} and {self.resolve_topic_name('odom')}"
-        )
+        warm_up(self._model, config)
+        self._statistics = Statistics(path.name, config.node.max_failures)
+        self._worker = Worker(self._model, config, self._skip, self._logbook.warn)
+        self.configured.callback(self._forget)
+        self._outputs = Outputs(self)
+        self.configured.callback(self._outputs.destroy)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.configured.callback(self.destroy_publisher, self._diagnostics)
+        timer = self.create_timer(1.0, self._publish_diagnostics, clock=self._steady)
+        self.configured.callback(self.destroy_timer, timer)
+        reset = self.create_service(Trigger, "~/reset", self._reset)
+        self.configured.callback(self.destroy_service, reset)
+        self._config = config
+        self.get_logger().info(f"ready: model {path.name} of {self._model.n_examples} examples")
 
-    def _configured(self, model: Model) -> Config:
-        defaults = Config(**{name: getattr(model.pipeline, name) for name in PIPELINE})
-        config = parameters.declare(self, defaults)
+    def listen(self) -> None:
+        """Start anew: clouds, odometry and what follows from them."""
+        self._statistics.listen(True)
+        self.active.callback(self._statistics.listen, False)
+        self.active.callback(self._worker.stop)
+        # a guard runs after the subscriptions, so that the newest cloud is there when work starts
+        self._work_is_there = self.create_guard_condition(self._work)
+        self.active.callback(self.destroy_guard_condition, self._work_is_there)
+        timer = self.create_timer(_TICK_S, self._expire, clock=self._steady)
+        self.active.callback(self.destroy_timer, timer)
+        backward = JumpThreshold(
+            min_forward=None, min_backward=Duration(nanoseconds=-JUMP_NS), on_clock_change=False
+        )
+        jumps = self.get_clock().create_jump_callback(backward, post_callback=self._on_jump)
+        self.active.callback(jumps.unregister)
+        odometry = self.create_subscription(Odometry, "odom", self._on_odometry, _best_effort(200))
+        self.active.callback(self.destroy_subscription, odometry)
+        clouds = self.create_subscription(PointCloud2, "points", self._on_cloud, _best_effort(2))
+        self.active.callback(self.destroy_subscription, clouds)
+        self.get_logger().info(f"listening to {odometry.topic_name} and {clouds.topic_name}")
+
+    def _declared(self, model: Model) -> Config:
+        if self._defaults is not None:
+            parameters.release(self, self._defaults)
+        self._defaults = Config(**{name: getattr(model.pipeline, name) for name in PIPELINE})
+        config = parameters.declare(self, self._defaults)
         if config.grid != model.pipeline.grid:
             raise ConfigError(f"parameters grid.* must be the model's, {model.pipeline.grid}")
         for name in parameters.unknown(self):
             self.get_logger().warning(f"unknown parameter {name} has no effect")
-        for difference in differences(config, model.pipeline):
-            self.get_logger().warning(f"not as the model was trained: {difference}")
+        self._warn_of_differences(config, model)
         return config
 
-    def _connect(self) -> None:
-        shallow = QoSProfile(
-            history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT, depth=2
-        )
-        deep = QoSProfile(
-            history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT, depth=200
-        )
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._relative = self.create_publisher(PoseWithCovarianceStamped, "~/relative_pose", 10)
-        self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/pose", 10)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        # a guard runs after the subscriptions, so that the newest cloud is there when work starts
-        self._work_is_there = self.create_guard_condition(self._work)
-        self.create_timer(_TICK_S, self._expire, clock=steady)
-        self.create_timer(1.0, self._publish_diagnostics, clock=steady)
-        self.add_on_set_parameters_callback(self._check_parameters)
-        self.add_post_set_parameters_callback(self._apply_parameters)
-        backward = JumpThreshold(
-            min_forward=None, min_backward=Duration(nanoseconds=-JUMP_NS), on_clock_change=False
-        )
-        self._jumps = self.get_clock().create_jump_callback(
-            backward, post_callback=self._on_clock_jump
-        )
-        self.create_subscription(Odometry, "odom", self._on_odometry, deep)
-        self.create_subscription(PointCloud2, "points", self._on_cloud, shallow)
+    def _forget(self) -> None:
+        self._config = None
+        del self._worker, self._model
+
+    # what is heard
 
     def _on_odometry(self, message: Odometry) -> None:
         self._statistics.counts["odometry"] += 1
-        stamp_ns = messages.stamp_ns_of(message)
-        try:
-            self._check_not_in_future(stamp_ns)
-            T = messages.pose_from(message.pose.pose)
-            if stamp_order(stamp_ns, self._odometry.newest_ns) == "jump":
-                self._forget(stamp_ns)
-            self._odometry.add(stamp_ns, T)
-        except OdometryError as error:
+        if not self._worker.hear_odometry(message, self._now_ns()):
             self._statistics.counts["odometry_rejected"] += 1
-            self._warn("odometry", f"odometry message rejected: {error}")
-            return
-        self._odometry_frame = message.header.frame_id or "odom"
-        if len(self._intake):
+        elif self._worker.has_work:
             self._work_is_there.trigger()
 
     def _on_cloud(self, message: PointCloud2) -> None:
         self._statistics.counts["received"] += 1
-        received_s = time.monotonic()
-        stamp_ns = messages.stamp_ns_of(message)
-        points = self._admitted(stamp_ns, message)
-        if isinstance(points, Skip):
-            self._skip(points)
-            return
-        job = Job(stamp_ns, points, message.header.frame_id, received_s)
-        for skip in self._intake.offer(job):
-            self._skip(skip)
-        self._work_is_there.trigger()
+        self._worker.hear_cloud(message, self._now_ns())
+        if self._worker.has_work:
+            self._work_is_there.trigger()
 
-    def _admitted(self, stamp_ns: int, message: PointCloud2) -> Array | Skip:
-        """Return the points of a cloud in its turn; a damaged one does not move the clock."""
-        try:
-            self._check_not_in_future(stamp_ns)
-            points = read_points(message)
-        except OdometryError as error:
-            return Skip(stamp_ns, "future_stamp", str(error))
-        except CloudError as error:
-            return Skip(stamp_ns, "malformed", str(error))
-        except Exception as error:  # whatever bytes may do, the node outlives them
-            return Skip(stamp_ns, "malformed", f"{type(error).__name__}: {error}")
-        order = stamp_order(stamp_ns, self._newest_cloud_ns)
-        if order == "jump":
-            self._forget(stamp_ns)
-        elif order != "later":
-            sentence = f"{order.replace('_', ' ')}: not later than the cloud before"
-            return Skip(stamp_ns, order, sentence)
-        self._newest_cloud_ns = stamp_ns
-        return points
+    def _expire(self) -> None:
+        self._worker.expire(_TICK_S)
+
+    def _on_jump(self, jump: TimeJump) -> None:
+        self._worker.jump_to(self._now_ns())
+
+    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._worker.reset()
+        response.success = True
+        response.message = "the reference and the chain are forgotten"
+        return response
+
+    # what is said
 
     def _work(self) -> None:
-        job, skips = self._intake.take()
-        for skip in skips:
-            self._skip(skip)
-        if job is None or job.T_odom_base is None:
+        job = self._worker.take()
+        if job is None:
             return
         try:
-            answer = self._tracker.step(
-                job.stamp_ns, job.points, job.T_odom_base @ self._T_base_sensor
-            )
+            answer = self._worker.answer(job)
             if answer is None:
                 self._statistics.reference(job.stamp_ns)
             else:
@@ -192,134 +167,54 @@ class CovarianceNode(Node):
             self.get_logger().error(traceback.format_exc())
             self._skip(Skip(job.stamp_ns, "internal", f"{type(error).__name__}: {error}"))
         self._publish_diagnostics()
-        if len(self._intake):
+        if self._worker.has_work:
             self._work_is_there.trigger()
 
     def _publish(self, job: Job, answer: Answer) -> None:
-        T_ref_read = answer.estimate.registration.T_ref_read
-        relative = self._with_covariance(job, job.frame_id, T_ref_read, answer.estimate.covariance)
-        pose = self._with_covariance(job, self._odometry_frame, answer.T_odom_read, answer.Y_chain)
-        self._relative.publish(relative)
-        self._pose.publish(pose)
-        now_ns = self.get_clock().now().nanoseconds
-        C = relative.pose.covariance.reshape(6, 6)
-        self._statistics.answer(answer, C, job.received_s, now_ns)
-
-    def _with_covariance(
-        self, job: Job, frame_id: str, T: Array, Y: Array
-    ) -> PoseWithCovarianceStamped:
-        config = self.config.node
-        C = messages.ros_covariance(
-            Y, T[:3, :3], config.floor_sigma_m, config.floor_sigma_rad, config.ceiling
-        )
-        return messages.pose_with_covariance(job.stamp_ns, frame_id, T, C)
-
-    def _expire(self) -> None:
-        skips = self._intake.expire(_TICK_S, self.config.node.odometry_timeout_s)
-        for skip in skips:
-            self._skip(skip)
+        assert self._config is not None
+        C = self._outputs.publish(job, answer, self._worker.odometry_frame, self._config.node)
+        self._statistics.answer(answer, C, job.received_s, self._now_ns())
 
     def _skip(self, skip: Skip) -> None:
         self._statistics.fail(skip.stamp_ns, skip.reason, skip.sentence)
         if skip.reason != "superseded":
-            self._warn(skip.reason, f"cloud skipped: {skip.sentence}")
+            self._logbook.warn(skip.reason, f"cloud skipped: {skip.sentence}")
         self._publish_diagnostics()
-
-    def _warn(self, kind: str, sentence: str) -> None:
-        """Log, but sentences that differ only in numbers at most once a while."""
-        key, now_s = kind + re.sub(r"[0-9.]+", "", sentence), time.monotonic()
-        if now_s - self._warned_s.get(key, -math.inf) >= _WARNING_PERIOD_S:
-            if len(self._warned_s) >= _MAX_WARNINGS:
-                self._warned_s.clear()
-            self._warned_s[key] = now_s
-            self.get_logger().warning(sentence)
 
     def _publish_diagnostics(self) -> None:
         name = f"{self.get_name()}: registration"
-        now_ns = self.get_clock().now().nanoseconds
-        self._diagnostics.publish(self._statistics.message(name, now_ns, self._tracker.n_restarts))
+        self._diagnostics.publish(
+            self._statistics.message(
+                name, self._now_ns(), self._worker.n_restarts, self._worker.n_clock_jumps
+            )
+        )
 
-    def _check_not_in_future(self, stamp_ns: int) -> None:
-        """Raise OdometryError for a stamp after now; a simulated clock at 0 has not started."""
-        now_ns = self.get_clock().now().nanoseconds
-        ahead_s = 1e-9 * (stamp_ns - now_ns)
-        if now_ns > 0 and ahead_s > self.config.node.future_tolerance_s:
-            raise OdometryError(f"the stamp is {ahead_s:.3f} s in the future")
+    def _now_ns(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
 
-    def _on_clock_jump(self, jump: TimeJump) -> None:
-        self._forget(self.get_clock().now().nanoseconds)
-
-    def _forget(self, stamp_ns: int) -> None:
-        """Time has jumped back to ``stamp_ns``: what is remembered lies in the future."""
-        self._statistics.counts["clock_jumps"] += 1
-        self._warn("clock_jump", "time jumped back: everything remembered is forgotten")
-        for skip in self._intake.clear():
-            self._skip(skip)
-        newest_ns = self._odometry.newest_ns
-        if newest_ns is not None and newest_ns - stamp_ns > JUMP_NS:
-            self._odometry.clear()
-        self._newest_cloud_ns = None
-        self._tracker.reset()
+    # parameters
 
     def _check_parameters(self, given: list[Parameter]) -> SetParametersResult:
         try:
-            parameters.changed(self.config, given)
+            if self._config is not None:
+                parameters.changed(self._config, given)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, given: list[Parameter]) -> None:
-        self.config = parameters.changed(self.config, given)
-        self._tracker.pipeline = self.config
-        self._tracker.config = self.config.node
-        self._odometry.gap_s = self.config.node.odometry_gap_s
-        for difference in differences(self.config, self._tracker.model.pipeline):
+        if self._config is None:  # configure reads them
+            return
+        self._config = parameters.changed(self._config, given)
+        self._worker.set_config(self._config)
+        self._warn_of_differences(self._config, self._model)
+
+    def _warn_of_differences(self, config: Config, model: Model) -> None:
+        for difference in differences(config, model.pipeline):
             self.get_logger().warning(f"not as the model was trained: {difference}")
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until it is told to stop; the return value is the exit status."""
-    is_starting = True
-
-    def stop(*_: Any) -> None:  # once the node spins, rclpy's own handler ends it
-        nonlocal is_starting
-        if is_starting:
-            is_starting = False
-            raise KeyboardInterrupt
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stop)
-    try:
-        _initialise(args)
-        with threadpool_limits(1, user_api="blas"):  # its waiting threads take the kernels' cores
-            node = CovarianceNode()
-            is_starting = False
-            rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
-    except Cello3dError as error:
-        print(f"{NAME}: {error}", file=sys.stderr)
-        return 1
-    except RuntimeError:  # what rclpy raises when a signal has ended its context in mid-callback
-        if rclpy.ok():
-            raise
-        return 0
-    finally:
-        is_starting = False
-        with contextlib.suppress(RuntimeError):  # rclpy's own handler may be at it, too
-            try_shutdown()
-        for number in (signal.SIGINT, signal.SIGTERM):  # impatience does not change the status
-            signal.signal(number, signal.SIG_IGN)
-    return 0
-
-
-def _initialise(args: Sequence[str] | None) -> None:
-    try:
-        rclpy.init(args=None if args is None else list(args))
-    except (RuntimeError, ValueError) as error:
-        text = " ".join(str(error).split())
-        raise ConfigError(f"cannot start with these ROS arguments: {text}") from None
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def _best_effort(depth: int) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT, depth=depth
+    )

@@ -15,23 +15,42 @@ from rclpy.parameter import Parameter
 from cello3d_ros.config import SECTIONS, Config
 from cello3d_ros.errors import ConfigError
 
-MODEL = "node.model"
+MODEL, AUTOSTART = "node.model", "node.autostart"
 
-_FIXED = {"cloud", "grid", "sampling", "training"}  # sections read once, when the node starts
-_FIXED_SETTINGS = {MODEL, "node.T_base_sensor", "node.odometry_buffer_s", "node.seed"}
+_FIXED = {"cloud", "grid", "sampling", "training"}  # sections read once, by configure
+_FIXED_SETTINGS = {
+    *(MODEL, AUTOSTART),
+    *("node.T_base_sensor", "node.odometry_buffer_s", "node.seed"),
+}
 _INT64 = 2**63 - 1
 
 
-def declare_model(node: Node) -> str:
-    """Declare and return ``node.model`` alone: the defaults of the others come from the model."""
-    field = next(f for f in dataclasses.fields(SECTIONS["node"]) if f.name == "model")
-    return str(_declare(node, MODEL, field, field.default))
+def declare_first(node: Node) -> None:
+    """Declare what is needed to configure: the defaults of the others come from the model."""
+    for field in dataclasses.fields(SECTIONS["node"]):
+        if (name := f"node.{field.name}") in (MODEL, AUTOSTART):
+            _declare(node, name, field, field.default)
+
+
+def release(node: Node, defaults: Config) -> None:
+    """Undeclare the settings still at their defaults: the next model brings its own."""
+    for section in SECTIONS:
+        for field in dataclasses.fields(SECTIONS[section]):
+            name, value = (
+                f"{section}.{field.name}",
+                getattr(getattr(defaults, section), field.name),
+            )
+            if name in (MODEL, AUTOSTART) or not node.has_parameter(name):
+                continue
+            if _plain(node.get_parameter(name).value) == value:
+                node.undeclare_parameter(name)
 
 
 def declare(node: Node, defaults: Config) -> Config:
     """Declare every setting as ``section.name`` and return what they are set to.
 
-    Raises ConfigError naming the parameter, its value and what is allowed.
+    A setting that is declared keeps its value.  Raises ConfigError naming the parameter, its
+    value and what is allowed.
     """
     given = overrides(node)
     values: dict[str, Any] = {}
@@ -48,14 +67,19 @@ def declare(node: Node, defaults: Config) -> Config:
 
 
 def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
-    """Return the configuration with some parameters set anew.  Raises ConfigError."""
-    values = {
-        f"{section}.{field.name}": getattr(getattr(config, section), field.name)
-        for section in SECTIONS
-        for field in dataclasses.fields(SECTIONS[section])
-    }
+    """Return the configuration with some parameters set anew.
+
+    Raises ConfigError for a value out of range and for a setting that only configure reads.
+    """
+    parameters = list(parameters)
+    for name in (parameter.name for parameter in parameters):
+        if name.split(".")[0] in _FIXED or name in _FIXED_SETTINGS:
+            raise ConfigError(
+                f"parameter {name} is read when the node is configured: "
+                "clean the node up, set it and configure again"
+            )
     new = {parameter.name: parameter.value for parameter in parameters}
-    return _config({name: new.get(name, value) for name, value in values.items()})
+    return _config({name: new.get(name, value) for name, value in _values(config).items()})
 
 
 def overrides(node: Node) -> dict[str, Any]:
@@ -87,11 +111,7 @@ def _declare(node: Node, name: str, field: dataclasses.Field[Any], default: Any)
 
 def _descriptor(name: str, field: dataclasses.Field[Any]) -> ParameterDescriptor:
     low, high = field.metadata["low"], field.metadata["high"]
-    descriptor = ParameterDescriptor(
-        name=name,
-        description=field.metadata["doc"],
-        read_only=name.split(".")[0] in _FIXED or name in _FIXED_SETTINGS,
-    )
+    descriptor = ParameterDescriptor(name=name, description=field.metadata["doc"])
     if field.metadata["choices"]:
         descriptor.additional_constraints = "one of " + ", ".join(field.metadata["choices"])
     elif isinstance(field.default, tuple) and (low, high) != (-math.inf, math.inf):
@@ -117,6 +137,15 @@ def _of(section: str, values: dict[str, Any]) -> dict[str, Any]:
     return {name: values[f"{section}.{name}"] for name in known if f"{section}.{name}" in values}
 
 
+def _values(config: Config) -> dict[str, Any]:
+    """Return every setting by its name as a parameter."""
+    return {
+        f"{section}.{field.name}": getattr(getattr(config, section), field.name)
+        for section in SECTIONS
+        for field in dataclasses.fields(SECTIONS[section])
+    }
+
+
 def _config(values: dict[str, Any]) -> Config:
     return Config(**{section: _built(section, _of(section, values)) for section in SECTIONS})
 
@@ -124,12 +153,13 @@ def _config(values: dict[str, Any]) -> Config:
 def _built(section: str, values: dict[str, Any]) -> Any:
     """Build a section; ConfigError speaks of parameters as they are called in ROS."""
     kind = SECTIONS[section]
-    plain = {
-        name: value if isinstance(value, (bool, int, float, str)) else tuple(value)
-        for name, value in values.items()
-    }
     try:
-        return kind(**plain)
+        return kind(**{name: _plain(value) for name, value in values.items()})
     except ConfigError as error:
         text = str(error).replace(f"{kind.__name__}.", f"parameter {section}.")
         raise ConfigError(text) from None
+
+
+def _plain(value: Any) -> Any:
+    """Return a parameter's value as the configuration has it."""
+    return value if isinstance(value, (bool, int, float, str)) else tuple(value)

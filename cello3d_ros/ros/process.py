@@ -58,7 +58,7 @@ class NodeProcess:
     ) -> None:
         """Start the node.  parameters: by name, as given to ``-p``."""
         self.log = log
-        command = [sys.executable, "-m", "cello3d_ros.ros.node", "--ros-args", *ros_arguments]
+        command = [sys.executable, "-m", "cello3d_ros.ros.main", "--ros-args", *ros_arguments]
         for name, value in (parameters or {}).items():
             command += ["-p", f"{name}:={value}"]
         with open(log, "wb") as stream:

@@ -1,3 +1,4 @@
+import tracemalloc
 from types import SimpleNamespace
 
 import numpy as np
@@ -68,6 +69,15 @@ def test_the_last_row_may_come_without_its_padding(points):
     cloud = message(points, PLAIN, height=6, padding=5)
     cloud.data = cloud.data[:-5]
     np.testing.assert_array_equal(read_points(cloud), points[:, :3])
+
+
+def test_sizes_that_a_message_makes_up_cost_no_memory(points):
+    cloud = message(points, PLAIN)
+    cloud.row_step = 2**32 - 1
+    tracemalloc.start()
+    np.testing.assert_array_equal(read_points(cloud), points[:, :3])
+    assert tracemalloc.get_traced_memory()[1] < 1e6
+    tracemalloc.stop()
 
 
 def test_rows_of_no_position_take_their_companions_along(points):

@@ -1,7 +1,7 @@
 """Real ROS with checked message fields, seen by this machine only, in a domain of this run."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,18 @@ class Robot:
         self.n += 1
         self.stamp_ns += dt_ns
         return self.stamp_ns
+
+    def reconnect(self) -> None:
+        """Wait until a node that has listened before hears again."""
+        player, n_before = self.player, int(self.player.replay.last_status["odometry_received"])
+
+        def heard() -> bool:
+            if player.odometry.get_subscription_count() and player.clouds.get_subscription_count():
+                self.stamp_ns += STEP_NS // 100
+                player.publish_odometry(self.stamp_ns, self.pose())
+            return int(player.replay.last_status["odometry_received"]) > n_before
+
+        assert player.spin_until(heard, 20.0)
 
     def send(self, cloud: Any, odometry: bool = True, timeout_s: float = 10.0) -> dict[str, str]:
         """Send points or a whole message stamped now; return what diagnostics say of it."""
@@ -146,6 +158,35 @@ def lone_robot(player: Any) -> Robot:
     robot = Robot(player)
     player.connect(robot.stamp_ns, robot.pose(), 60.0)
     return robot
+
+
+@pytest.fixture(scope="module")
+def ask(player: Any) -> Callable[..., Any]:
+    """Call a service of the node."""
+
+    def call(kind: Any, name: str, request: Any) -> Any:
+        client = player._node.create_client(kind, f"/covariance_node/{name}")
+        assert player.spin_until(client.service_is_ready, 60.0)
+        future = client.call_async(request)
+        assert player.spin_until(future.done, 180.0)
+        player._node.destroy_client(client)
+        return future.result()
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def change(ask: Callable[..., Any]) -> Callable[..., Any]:
+    """Set one parameter and return the node's verdict."""
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+
+    def call(name: str, value: object) -> Any:
+        message = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[message])
+        return ask(SetParameters, "set_parameters", request).results[0]
+
+    return call
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cello3d_ros.ros.intake import Intake, Job, stamp_order
+from cello3d_ros.ros.intake import Intake, Job, Skip, stamp_order
 from cello3d_ros.ros.odometry import OdometryBuffer
 
 S = 1_000_000_000
@@ -120,5 +120,5 @@ def test_a_cloud_whose_odometry_has_come_does_not_expire() -> None:
 def test_clear_names_what_it_forgot() -> None:
     intake = Intake(odometry())
     intake.offer(job(S))
-    assert [skip.reason for skip in intake.clear()] == ["clock_jump"]
+    assert intake.clear("clock_jump", "time jumped") == [Skip(S, "clock_jump", "time jumped")]
     assert len(intake) == 0
