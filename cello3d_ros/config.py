@@ -132,6 +132,11 @@ class TrainingConfig(Section):
         "what covariances are relative to; none is the paper",
         choices=("none", "hessian", "sandwich"),
     )
+    features: str = _setting(
+        "global",
+        "what Theta is learned over; descriptor is the paper's, global a few numbers of the pair",
+        choices=("descriptor", "global", "both"),
+    )
     theta: str = _setting(
         "low_rank", "form of Theta", choices=("upper_triangular", "diagonal", "low_rank")
     )

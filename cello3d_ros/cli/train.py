@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="recordings, the same way, that are not looked at: those kept for tests",
     )
     parser.add_argument("--config", metavar="FILE", help="YAML settings, section training")
-    for name in ("shape", "theta", "loss"):
+    for name in ("shape", "features", "theta", "loss"):
         choices = TrainingConfig.__dataclass_fields__[name].metadata["choices"]
         parser.add_argument(f"--{name}", choices=choices, help="in place of the setting")
 
@@ -135,7 +135,7 @@ def _recordings(datasets: Sequence[Dataset]) -> list[str]:
 
 def _settings(arguments: argparse.Namespace) -> TrainingConfig:
     config = load_config(arguments.config).training if arguments.config else TrainingConfig()
-    flags = {name: getattr(arguments, name) for name in ("shape", "theta", "loss")}
+    flags = {name: getattr(arguments, name) for name in ("shape", "features", "theta", "loss")}
     return replace(config, **{name: value for name, value in flags.items() if value})
 
 

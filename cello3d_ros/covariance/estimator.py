@@ -22,7 +22,8 @@ class Estimate(NamedTuple):
 
     covariance: (6, 6), reading side, ordered (u, omega), by ``method``; nearest_rho: squared
     distance of the model's nearest training example; effective_neighbors: how many examples
-    share in the model's answer.
+    share in the model's answer; novelty: in [0, 1], how far from all of them beside the training
+    pairs (``Prediction``).
     """
 
     registration: Registration
@@ -31,6 +32,7 @@ class Estimate(NamedTuple):
     nearest_rho: float
     effective_neighbors: float
     method: str = "model"
+    novelty: float = 0.0
 
 
 def estimate(
@@ -51,9 +53,9 @@ def estimate(
     and T_init not looked at.  A registration that reached its last iteration is returned with
     ``converged`` False: its covariance says little.  Raises RegistrationError when ICP or the
     method has no answer, NoOverlapError when the clouds share too little and ModelError when the
-    grid is not the model's.
+    model looks at the descriptor and the grid is not the model's.
     """
-    if pipeline.grid != model.pipeline.grid:
+    if model.features != "global" and pipeline.grid != model.pipeline.grid:
         raise ModelError(f"the model was trained with {model.pipeline.grid}, not {pipeline.grid}")
     if registration is None:
         registration = register(reading, reference, T_init, pipeline.icp, rng)
@@ -72,6 +74,7 @@ def estimate(
         prediction.nearest_rho,
         prediction.effective_neighbors,
         method,
+        prediction.novelty,
     )
 
 

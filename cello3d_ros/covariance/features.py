@@ -23,12 +23,15 @@ FEATURES = (
     "log_trim_m",
     "log_residual_m",
     "log_condition",
-    *(f"log_sandwich_against_hessian_{k}" for k in range(6)),
+    "log_least_sandwich_against_hessian",
+    "log_mean_sandwich_against_hessian",
+    "log_largest_sandwich_against_hessian",
     "log_associations",
     "log_reading_points_per_draw",
     "log_reference_points_per_draw",
     "log_motion_m",
 )
+KINDS = ("descriptor", "global", "both")  # what a model may look at
 _MOTION_M = 0.1  # added to the distance of the two sensors, so that its logarithm is bounded
 
 
@@ -44,25 +47,40 @@ def global_features(
 
     The share of the reading that overlaps; the standard deviation of the sandwich in translation
     and in rotation; the distance up to which ICP keeps associations, their root mean square
-    point-to-plane residual, their number; the condition of H in units in which its diagonal is 1;
-    the eigenvalues of the sandwich against ``rms^2 H^-1``, which independent residuals would make
-    (ascending: large where residuals of a point's neighbours agree); how many points stand behind
-    each that ICP draws, in either cloud; the distance of the two sensors.
+    point-to-plane residual, their number; the condition of H in units in which the mean variances
+    of translation and of rotation are 1; the least, geometric mean and largest eigenvalue of the
+    sandwich against ``rms^2 H^-1``, which independent residuals would make; how many points stand
+    behind each that ICP draws, in either cloud; the distance of the two sensors.
     """
     limit, rms, n = _residuals(reading, reference, T_ref_read, overlap, config)
     S, H_inverse = shapes["sandwich"], shapes["hessian"]
     spread = np.sqrt([np.trace(S[:3, :3]), np.trace(S[3:, 3:])])
-    unit = 1.0 / np.sqrt(np.diag(H_inverse))
-    scaled, vectors = np.linalg.eigh(H_inverse * np.outer(unit, unit))
-    root = vectors / np.sqrt(scaled) * unit[:, None]  # root^T H^-1 root = I
-    against = np.maximum(np.linalg.eigvalsh(root.T @ S @ root), 1e-300) / rms**2
+    traces = np.trace(H_inverse[:3, :3]), np.trace(H_inverse[3:, 3:])
+    unit = np.repeat(np.sqrt(3.0 / np.array(traces)), 3)
+    variances, vectors = np.linalg.eigh(H_inverse * np.outer(unit, unit))
+    root = unit[:, None] * vectors / np.sqrt(variances)  # root^T H^-1 root = I
+    ratios = np.maximum(np.linalg.eigvalsh(root.T @ S @ root), 1e-300) / rms**2
+    against = ratios[0], np.exp(np.log(ratios).mean()), ratios[-1]
     drawn = (
         len(reading.points) / min(len(reading.points), config.n_reading_points),
         len(reference.points) / min(len(reference.points), config.n_reference_points),
     )
     motion = np.linalg.norm(T_ref_read[:3, 3]) + _MOTION_M
-    logs = np.log([*spread, limit, rms, scaled[-1] / scaled[0], *against, n, *drawn, motion])
+    logs = np.log([*spread, limit, rms, variances[-1] / variances[0], *against, n, *drawn, motion])
     return np.concatenate([[overlap.ratio], logs])
+
+
+def model_inputs(kind: str, descriptors: Array, features: Array) -> Array:
+    """Return what a model looks at of a pair, or of many.
+
+    kind: one of ``KINDS``; descriptors: (..., R, D), the first as recorded, the others turned
+    about z; features: (..., G).  Returns (..., R, D) for "descriptor", (..., 1, G) or
+    (..., 1, G + D) otherwise: global features do not tell the turns of a pair apart.
+    """
+    if kind == "descriptor":
+        return descriptors
+    row = np.asarray(features)[..., None, :]
+    return row if kind == "global" else np.concatenate([row, descriptors[..., :1, :]], axis=-1)
 
 
 def _residuals(

@@ -20,6 +20,7 @@ from cello3d_ros.learning.evaluation import best_scale, figures, select
 from cello3d_ros.learning.examples import (
     Examples,
     load_examples,
+    select_inputs,
     to_absolute,
     unturned_rows,
 )
@@ -77,8 +78,12 @@ def from_dataset(
     mean: (6, 6), the baseline.  Raises DatasetError where the dataset's settings are not the
     model's: its descriptors would not be comparable.
     """
-    if found := differences(examples.pipeline, model.pipeline):
+    found = differences(examples.pipeline, model.pipeline)
+    if model.features == "global":
+        found = [difference for difference in found if not difference.startswith("grid.")]
+    if found:
         raise DatasetError(f"the dataset does not go with the model: {found[0]}")
+    examples = select_inputs(examples, model.features)
     if model.shape != "none" and model.shape not in examples.shapes:
         raise DatasetError(f"the dataset does not hold the {model.shape} of each pair")
     n = len(examples.covariances)

@@ -54,8 +54,9 @@ class PairRecord:
     """What brute force found out about one pair; a rejected pair leaves out what it lacks.
 
     ``kept`` says which of ``xi`` made the covariance Y, about ground truth, reading side.
-    ``features`` are those that ``FEATURES`` names.  ``descriptors[r]`` and, by adjoints, the covariance describe the pair turned about z of the
-    reading frame by ``rotations_rad[r]``; ``covariance`` and ``shapes`` themselves are not turned.
+    ``features`` are those that ``FEATURES`` names.  ``descriptors[r]`` and, by adjoints, the
+    covariance describe the pair turned about z of the reading frame by ``rotations_rad[r]``;
+    ``covariance`` and ``shapes`` themselves are not turned.
     """
 
     recording: str

@@ -141,6 +141,7 @@ def select(examples: Examples, keep: NDArray[np.bool_]) -> Examples:
     return dataclasses.replace(
         examples,
         features=examples.features[keep],
+        global_features=examples.global_features[keep[: len(examples.global_features)]],
         covariances=examples.covariances[keep],
         groups=examples.groups[keep],
         shapes={name: S[keep] for name, S in examples.shapes.items()},

@@ -20,9 +20,15 @@ from cello3d_ros.geometry.packed import unpack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import package_versions
 from cello3d_ros.learning.evaluation import Figures, evaluate
-from cello3d_ros.learning.examples import Examples, feature_scaler, flat_features
+from cello3d_ros.learning.examples import (
+    Examples,
+    feature_scaler,
+    flat_features,
+    select_inputs,
+)
 from cello3d_ros.learning.loss import (
     Problem,
+    evidence,
     expand_features,
     leave_out_problem,
     loss_and_gradient,
@@ -35,6 +41,7 @@ from cello3d_ros.learning.loss import (
 
 Progress = Callable[[int, float, float], None]  # iteration, training loss, what Theta is judged by
 
+_LEVELS = np.linspace(0.0, 1.0, 101)  # of the quantiles that a model keeps
 _PATIENCE = 20  # iterations without a better validation loss that end training
 
 
@@ -67,6 +74,9 @@ def train(
     Theta = 0, the mean of the examples, takes part.  Deterministic; an interrupt (Ctrl-C) ends
     training with the best so far.  Raises DatasetError for fewer than two recordings.
     """
+    examples = select_inputs(examples, config.features)
+    if validation is not None:
+        validation = select_inputs(validation, config.features)
     _check_groups(examples, validation)
     mean, scale, active = feature_scaler(examples)
     problem = leave_out_problem(examples, config, mean, scale)
@@ -92,6 +102,7 @@ def train(
         "figures": figures,
         "versions": package_versions(),
     }
+    nearest, neighbors = evidence(theta, problem)
     model = Model(
         theta=theta,
         mean=mean,
@@ -99,6 +110,9 @@ def train(
         projections=project(flat_features(examples), theta, mean, scale),
         covariances=unpack(problem.packed_examples),
         shape=config.shape,
+        features=config.features,
+        rho_quantiles=np.quantile(nearest, _LEVELS),
+        neighbors_quantiles=np.quantile(neighbors, _LEVELS),
         mean_weight=config.mean_weight,
         pipeline=examples.pipeline,
         sampling=examples.sampling,

@@ -11,6 +11,7 @@ import pytest
 from cello3d_ros.cli.main import main
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import SamplingConfig
+from cello3d_ros.covariance.features import FEATURES
 from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.geometry.se3 import Array, exp, inverse, transform
 from cello3d_ros.learning.dataset import PairRecord, open_dataset
@@ -45,6 +46,7 @@ def record(name: str, i: int, offset_m: float = 0.0, n_features: int = 704) -> P
         kept=np.ones(60, np.bool_),
         covariance=Y,
         descriptors=rng.random((1, n_features), dtype=np.float32),
+        features=rng.normal(size=len(FEATURES)),
         rotations_rad=np.zeros(1),
         shapes={"sandwich": Y / 4.0, "hessian": Y * 100.0},
     )
@@ -235,4 +237,4 @@ def test_descriptors_of_another_length_are_said(
     other.write(record("street", 0, n_features=22))
     words = [str(folder / "short"), "--baseline", str(folder / "set")]
     assert main(["evaluate", *words, "--model", str(folder / "model.npz")]) == 1
-    assert "descriptor has shape (22,)" in complaint(capsys)
+    assert "descriptor input has shape (22,)" in complaint(capsys)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cello3d_ros.config import CloudConfig, Pipeline
+from cello3d_ros.covariance.features import FEATURES
 from cello3d_ros.covariance.methods import MethodSettings
 from cello3d_ros.covariance.model import constant_model
 from cello3d_ros.errors import DatasetError
@@ -244,6 +245,7 @@ def test_the_baseline_is_the_mean_of_the_training_recordings(tmp_path):
                 T_mean=np.eye(4),
                 covariance=(k + 1.0) * np.eye(6),
                 descriptors=np.zeros((1, 3), np.float32),
+                features=np.zeros(len(FEATURES)),
                 rotations_rad=np.zeros(1),
             )
         )
