@@ -74,8 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         "--baseline",
         "DATASET",
-        "folders with the model's training recordings, whose mean covariance is the baseline; "
-        "DATASET by default",
+        "folders whose mean covariance is the baseline, in place of the one that the model was "
+        "trained on",
     )
     _words(
         parser,
@@ -107,7 +107,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print tables and write the JSON."""
     from cello3d_ros.covariance.methods import MethodSettings
     from cello3d_ros.covariance.model import load_model, shipped_model_path
-    from cello3d_ros.learning.comparison import from_dataset, training_mean
+    from cello3d_ros.learning.comparison import from_dataset, mean_of, training_mean
     from cello3d_ros.learning.dataset import open_dataset
     from cello3d_ros.learning.examples import load_examples
 
@@ -123,8 +123,8 @@ def run(arguments: argparse.Namespace) -> None:
     datasets = [open_dataset(folder) for folder in dict.fromkeys(arguments.datasets)]
     names = chosen(datasets, arguments.only, model, arguments.allow_seen)
     recordings = _recordings(arguments.recordings, names)
-    baseline = [open_dataset(folder) for folder in arguments.baseline] or datasets
-    mean = training_mean(model, baseline)
+    baseline = [open_dataset(folder) for folder in arguments.baseline]
+    mean = mean_of(baseline) if baseline else training_mean(model)
     examples = load_examples(datasets, names)
     keys = _accepted(datasets, names)
     predictions = from_dataset(model, examples, mean, settings)

@@ -95,6 +95,7 @@ def train(
         "recordings": examples.n_pairs,
         "validation_recordings": {} if validation is None else validation.n_pairs,
         "rejected_pairs": examples.rejected,
+        "mean_covariance": examples.covariances.mean(axis=0).tolist(),
         "rotations_rad": examples.rotations_rad.tolist(),
         "training": dataclasses.asdict(config),
         "iterations": search.n_iterations,
