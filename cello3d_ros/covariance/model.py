@@ -46,6 +46,7 @@ CONVENTIONS = {
     "relative": "S^-1/2 Y S^-1/2, symmetric root",
     "weight": "exp(-|Theta (d - d_k)|^2)",
 }
+SHIPPED = ("general", "structured", "semi_structured", "unstructured")
 SHAPES = ("none", "hessian", "sandwich")
 
 _MAX_HEADER_BYTES = 16 * 1024**2
@@ -64,6 +65,7 @@ class Model:
     projections: (N, r), Theta applied to the standardised training inputs.
     covariances: (N, 6, 6), of the sampled registrations; ``S^-1/2 Y S^-1/2`` unless shape is none.
     shape: what they are relative to.  mean_weight: share of their mean in every prediction.
+    margin: factor on every prediction, for what the training data leave out.
     features: what the inputs are, one of ``features.KINDS``.
     rho_quantiles, neighbors_quantiles: (Q,) or empty, evenly spaced quantiles of the nearest rho
     and of the effective neighbours of the training pairs, each seen from other recordings.
@@ -82,6 +84,7 @@ class Model:
     shape: str = "none"
     features: str = "descriptor"
     mean_weight: float = 0.0
+    margin: float = 1.0
     cutoff_rho: float = math.inf
     pipeline: Pipeline = field(default_factory=Pipeline)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -93,7 +96,7 @@ class Model:
         object.__setattr__(self, "provenance", _as_json(self.provenance))
         _check_extents(self)
         _check_settings(self)
-        for name in ("mean_weight", "cutoff_rho"):
+        for name in ("mean_weight", "margin", "cutoff_rho"):
             object.__setattr__(self, name, _number(name, getattr(self, name)))
         for start in range(0, len(self.covariances), _BLOCK):
             fine = is_positive_definite(self.covariances[start : start + _BLOCK])
@@ -159,7 +162,9 @@ def weigh(rho: Array, cutoff_rho: float = math.inf) -> Array:
 
 
 def predict(model: Model, inputs: ArrayLike, S: ArrayLike | None = None) -> Prediction:
-    """Return ``F = S^1/2 [(1 - a) sum_k w_k Y_k + a mean(Y)] S^1/2``, a the mean's weight.
+    """Return ``F = m S^1/2 [(1 - a) sum_k w_k Y_k + a mean(Y)] S^1/2``.
+
+    m is the model's margin, a the mean's weight.
 
     inputs: (D,), what ``model_inputs`` gives.  S: (6, 6), the pair's shape that ``model.shape``
     names, reading side; not looked at when that is none.  Raises ModelError where either does
@@ -179,7 +184,7 @@ def predict(model: Model, inputs: ArrayLike, S: ArrayLike | None = None) -> Pred
     w = weigh(rho, model.cutoff_rho)
     F = unpack(weighted_sum(w, model.packed_covariances))
     F = (1.0 - model.mean_weight) * F + model.mean_weight * model.mean_covariance
-    F = _scaled(F, S, model.shape)
+    F = _scaled(model.margin * F, S, model.shape)
     return Prediction(F, nearest, float(1.0 / (w @ w)), _rank(nearest, model.rho_quantiles))
 
 
@@ -222,6 +227,7 @@ def load_model(path: Path | str) -> Model:
             shape=header["shape"],
             features=header["features"],
             mean_weight=header["mean_weight"],
+            margin=header["margin"],
             cutoff_rho=math.inf if cutoff is None else cutoff,
             pipeline=pipeline_of(config),
             sampling=config.sampling,
@@ -231,9 +237,14 @@ def load_model(path: Path | str) -> Model:
         raise ModelError(f"{path}: {error}") from None
 
 
-def shipped_model_path() -> Path:
-    """Return the path of the model that comes with the package."""
-    return Path(str(importlib.resources.files("cello3d_ros").joinpath("models", "general.npz")))
+def shipped_model_path(name: str = "general") -> Path:
+    """Return the path of a model that comes with the package: one of ``SHIPPED``."""
+    return Path(str(importlib.resources.files("cello3d_ros").joinpath("models", f"{name}.npz")))
+
+
+def find_model(word: str | Path) -> Path:
+    """Return the path that a user means: a shipped model's name, a file, nothing for general."""
+    return shipped_model_path(str(word) or "general") if str(word) in ("", *SHIPPED) else Path(word)
 
 
 def _header(model: Model) -> dict[str, Any]:
@@ -247,6 +258,7 @@ def _header(model: Model) -> dict[str, Any]:
         "shape": model.shape,
         "features": model.features,
         "mean_weight": model.mean_weight,
+        "margin": model.margin,
         "cutoff_rho": None if math.isinf(model.cutoff_rho) else model.cutoff_rho,
         "provenance": model.provenance,
     }
@@ -366,6 +378,8 @@ def _check_settings(model: Model) -> None:
         raise ModelError(f"features must be one of {', '.join(KINDS)}: {model.features!r}")
     if not 0.0 <= _number("mean_weight", model.mean_weight) <= 1.0:
         raise ModelError(f"mean_weight must be in [0, 1]: {model.mean_weight!r}")
+    if not 0.0 < _number("margin", model.margin) < math.inf:
+        raise ModelError(f"margin must be positive and finite: {model.margin!r}")
     if not _number("cutoff_rho", model.cutoff_rho) >= 0.0:
         raise ModelError(f"cutoff_rho must not be negative: {model.cutoff_rho!r}")
 

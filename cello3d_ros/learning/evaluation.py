@@ -42,7 +42,7 @@ def evaluate(
     )
     constant = np.array([relative_means[name] for name in targets.groups])
     F = {
-        "model": to_absolute(predicted(theta, problem), targets, config.shape),
+        "model": to_absolute(config.margin * predicted(theta, problem), targets, config.shape),
         "mean_covariance": np.array([absolute_means[name] for name in targets.groups]),
         "constant": to_absolute(constant, targets, config.shape),
     }

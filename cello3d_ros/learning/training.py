@@ -115,6 +115,7 @@ def train(
         rho_quantiles=np.quantile(nearest, _LEVELS),
         neighbors_quantiles=np.quantile(neighbors, _LEVELS),
         mean_weight=config.mean_weight,
+        margin=config.margin,
         pipeline=examples.pipeline,
         sampling=examples.sampling,
         provenance=provenance,
