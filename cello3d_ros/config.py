@@ -147,7 +147,13 @@ class TrainingConfig(Section):
     margin: float = _setting(
         1.0, "factor on every predicted covariance, for what training data leave out", 1e-3, 1e3
     )
-    max_iterations: int = _setting(100, "optimiser steps", 1)
+    optimizer: str = _setting(
+        "lbfgs", "what searches Theta; sgd is the paper's", choices=("lbfgs", "sgd")
+    )
+    learning_rate: float = _setting(
+        1e-5, "of sgd: Theta goes down this times each pair's gradient", 1e-12
+    )
+    max_iterations: int = _setting(100, "optimiser steps; of sgd, passes over all pairs", 1)
     seed: int = _setting(0, "seed of the initial Theta", 0)
 
 
@@ -161,15 +167,78 @@ class NodeConfig(Section):
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
         "sensor in the odometry's child frame: x y z qx qy qz qw",
     )
+    use_tf: bool = _setting(
+        False, "take the sensor in the odometry's child frame from /tf, not from T_base_sensor"
+    )
+    base_frame: str = _setting("base_link", "the child frame of odometry that names none")
+    output_frame: str = _setting(
+        "sensor",
+        "whose motion is published: the sensor's or the odometry's child frame's",
+        choices=("sensor", "base"),
+    )
+    pairing: str = _setting(
+        "consecutive",
+        "what a cloud is registered to: the one before, a keyframe, or the topic reference_points",
+        choices=("consecutive", "keyframe", "topics"),
+    )
+    keyframe_distance_m: float = _setting(1.0, "distance that makes a new keyframe", 0.0)
+    keyframe_angle_rad: float = _setting(0.35, "rotation that makes a new keyframe", 0.0)
+    keyframe_min_overlap: float = _setting(
+        0.6, "overlap below which a new keyframe is made", 0.0, 1.0
+    )
+    reference_range_m: float = _setting(
+        60.0, "points of reference_points used around the sensor", 1.0, 1e4
+    )
+    registration: str = _setting(
+        "icp",
+        "who registers: this node, or another program (external_odometry or external_pose)",
+        choices=("icp", "external"),
+    )
+    external_tolerance_s: float = _setting(
+        1e-3, "largest distance in time of an external pose and its cloud", 0.0, 1.0
+    )
+    guess_without_odometry: str = _setting(
+        "skip",
+        "what to do with a cloud for which no odometry came in time",
+        choices=("skip", "constant_velocity", "extrapolate"),
+    )
+    max_extrapolation_s: float = _setting(0.5, "odometry is not extrapolated farther", 0.0, 60.0)
+    max_odometry_speed_m_s: float = _setting(
+        50.0, "odometry that moves faster has jumped: the chain starts again", 1e-3
+    )
     odometry_timeout_s: float = _setting(0.5, "wait for odometry after a cloud's stamp", 0.0, 60.0)
     odometry_gap_s: float = _setting(1.0, "odometry farther apart is not interpolated", 0.0)
     odometry_buffer_s: float = _setting(10.0, "odometry remembered", 0.1, 3600.0)
     max_pair_gap_s: float = _setting(10.0, "scans farther apart are not paired", 0.0)
     max_failures: int = _setting(3, "failed pairs before the reference is given up", 1)
     future_tolerance_s: float = _setting(0.5, "a cloud stamped later than now + this", 0.0)
+    covariance_mode: str = _setting(
+        "cello3d",
+        "what says how far a registration is to be trusted",
+        choices=("cello3d", "fused", "sigma_points", "censi", "hessian", "constant"),
+    )
+    sensor_sigma_m: float = _setting(
+        0.01, "range noise that censi, hessian and sigma_points assume", 1e-6, 10.0
+    )
+    n_registrations: int = _setting(12, "extra runs of ICP of the mode fused", 1, 200)
+    scale: float = _setting(1.0, "every covariance is multiplied by this", 1e-6, 1e6)
+    unknown_quantile: float = _setting(
+        0.99,
+        "share of the model's examples nearer to another recording than a known pair",
+        0.0,
+        1.0,
+    )
+    inflate_unknown: bool = _setting(
+        True, "widen the covariance of an unknown pair to the mean of the model's examples"
+    )
+    warn_sigma_m: float = _setting(0.3, "3 sigma along the weakest axis that warns", 0.0)
+    error_sigma_m: float = _setting(1.0, "3 sigma along the weakest axis that is an error", 0.0)
     floor_sigma_m: float = _setting(1e-4, "smallest published standard deviation", 1e-9)
     floor_sigma_rad: float = _setting(1e-5, "smallest published standard deviation", 1e-9)
     ceiling: float = _setting(900.0, "largest published eigenvalue (m^2, rad^2)", 1e-6, 1e3)
+    marker_scale: float = _setting(1.0, "~/markers are drawn this many times as large", 1e-3, 1e6)
+    marker_lifetime_s: float = _setting(10.0, "~/markers vanish after this; 0 is never", 0.0)
+    publish_tf: bool = _setting(False, "publish ~/pose on /tf as well; needs tf2_msgs")
     seed: int = _setting(0, "seed of the random subsamples", 0)
 
     def __post_init__(self) -> None:
@@ -180,6 +249,12 @@ class NodeConfig(Section):
                 "NodeConfig.T_base_sensor needs x y z and a unit quaternion qx qy qz qw: "
                 f"{self.T_base_sensor}"
             )
+        for name in ("floor_sigma_m", "floor_sigma_rad"):
+            if (floor := getattr(self, name)) ** 2 >= self.ceiling:
+                raise ConfigError(
+                    f"NodeConfig.{name} must be below the root of NodeConfig.ceiling, "
+                    f"{math.sqrt(self.ceiling):g}: {floor}"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,6 +287,7 @@ SECTIONS: dict[str, type[Any]] = {
 }
 
 PIPELINE = ("cloud", "icp", "overlap", "grid")
+_SCATTER = ("variance", "noise_m")  # of sampling: what the registrations of a model scattered by
 
 S = TypeVar("S", bound=Section)
 
@@ -261,12 +337,22 @@ def pipeline_of(config: Pipeline) -> Pipeline:
 
 
 def differences(ours: Pipeline, theirs: Pipeline) -> list[str]:
-    """Name each pipeline setting that differs: ``icp.trim_ratio is 0.8, not 0.7``."""
-    return [
-        f"{name}.{key} is {value}, not {getattr(getattr(theirs, name), key)}"
+    """Name each setting that differs and matters: ``icp.trim_ratio is 0.8, not 0.7``.
+
+    Those of the pipeline, and of two whole Configs the variances of sampling.
+    """
+    settings = [
+        (name, field.name)
         for name in PIPELINE
-        for key, value in dataclasses.asdict(getattr(ours, name)).items()
-        if value != getattr(getattr(theirs, name), key)
+        for field in dataclasses.fields(getattr(ours, name))
+    ]
+    if isinstance(ours, Config) and isinstance(theirs, Config):
+        settings += [("sampling", key) for key in _SCATTER]
+    return [
+        f"{name}.{key} is {value}, not {other}"
+        for name, key in settings
+        if (value := getattr(getattr(ours, name), key))
+        != (other := getattr(getattr(theirs, name), key))
     ]
 
 

@@ -23,7 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--init", metavar="FILE", help="first guess of T_ref_read: 16 or 12 numbers, row by row"
     )
-    parser.add_argument("--model", metavar="M", default="general", help="model file, or a shipped model's name")
+    parser.add_argument(
+        "--model", metavar="M", default="general", help="model file, or a shipped model's name"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the random subsamples")
     parser.add_argument("--json", action="store_true", help="print JSON")
 

@@ -61,7 +61,9 @@ _POSES = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
     parser.add_argument("datasets", nargs="+", type=Path, metavar="DATASET", help="folder")
-    parser.add_argument("--model", metavar="M", default="general", help="model file, or a shipped model's name")
+    parser.add_argument(
+        "--model", metavar="M", default="general", help="model file, or a shipped model's name"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="all figures, to write")
     parser.add_argument("--seed", type=int, default=0, help="of every random draw")
     _words(parser, "--only", "PATTERN", "recordings to evaluate, such as '*_s11'; all by default")

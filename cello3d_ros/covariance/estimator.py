@@ -12,6 +12,7 @@ from cello3d_ros.covariance.description import describe
 from cello3d_ros.covariance.methods import DEFAULTS, METHODS, MethodSettings, Pair, predicted
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import ModelError, RegistrationError
+from cello3d_ros.geometry.gaussian import larger
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.backends import register
 from cello3d_ros.registration.icp import Registration
@@ -23,7 +24,7 @@ class Estimate(NamedTuple):
     covariance: (6, 6), reading side, ordered (u, omega), by ``method``; nearest_rho: squared
     distance of the model's nearest training example; effective_neighbors: how many examples
     share in the model's answer; novelty: in [0, 1], how far from all of them beside the training
-    pairs (``Prediction``).
+    pairs (``Prediction``); is_unknown: whether the nearest is beyond the settings' limit.
     """
 
     registration: Registration
@@ -33,6 +34,7 @@ class Estimate(NamedTuple):
     effective_neighbors: float
     method: str = "model"
     novelty: float = 0.0
+    is_unknown: bool = False
 
 
 def estimate(
@@ -67,14 +69,18 @@ def estimate(
     Y = prediction.covariance
     if method != "model":
         Y = METHODS[method](pair, pipeline, model, rng, settings)
+    is_unknown = prediction.nearest_rho > settings.rho_limit
+    if is_unknown and settings.widen_unknown:
+        Y = larger(METHODS["constant"](pair, pipeline, model, rng, settings), Y)
     return Estimate(
         registration,
         description.overlap_ratio,
-        Y,
+        settings.scale * Y,
         prediction.nearest_rho,
         prediction.effective_neighbors,
         method,
         prediction.novelty,
+        is_unknown,
     )
 
 

@@ -244,7 +244,9 @@ def shipped_model_path(name: str = "general") -> Path:
 
 def find_model(word: str | Path) -> Path:
     """Return the path that a user means: a shipped model's name, a file, nothing for general."""
-    return shipped_model_path(str(word) or "general") if str(word) in ("", *SHIPPED) else Path(word)
+    return (
+        shipped_model_path(str(word) or "general") if str(word) in ("", *SHIPPED) else Path(word)
+    )
 
 
 def _header(model: Model) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings.odometry import PoseTrack
+
+Edge = tuple[str, str]  # parent and child
 
 
 class PoseLog:
@@ -39,9 +42,9 @@ class TransformTree:
     """Edges parent -> child: static, or tracks over time.  A frame's last parent counts."""
 
     def __init__(self) -> None:
-        self._logs: dict[tuple[str, str], PoseLog] = {}
-        self._static: dict[tuple[str, str], Array] = {}
-        self._tracks: dict[tuple[str, str], PoseTrack] = {}
+        self._logs: dict[Edge, PoseLog] = {}
+        self._static: dict[Edge, Array] = {}
+        self._tracks: dict[Edge, PoseTrack] = {}
 
     def add(self, message: Any, static: bool) -> None:
         """Keep the transforms of one TFMessage."""
@@ -61,25 +64,25 @@ class TransformTree:
 
     def static(self, parent: str, child: str) -> Array | None:
         """Return T_parent_child (4, 4) of static transforms; None if they do not connect."""
-        path = self._path(parent, child, set(self._static))
+        steps = way(parent, child, self._static)
         T = np.eye(4)
-        for edge, forward in path or []:
+        for edge, forward in steps or []:
             T = T @ (self._static[edge] if forward else se3.inverse(self._static[edge]))
-        return None if path is None else T
+        return None if steps is None else T
 
     def at(self, parent: str, child: str, stamp_ns: int) -> Array | None:
         """Return T_parent_child (4, 4) at a time; None outside the span of the transforms.
 
         Raises RecordingError when no transforms connect the two frames.
         """
-        path = self._path(parent, child, {*self._static, *self._logs})
-        if path is None:
+        steps = way(parent, child, {*self._static, *self._logs})
+        if steps is None:
             raise RecordingError(
                 f"no transforms connect {parent!r} and {child!r}; frames are "
                 f"{', '.join(self.frames) or 'none'}"
             )
         T = np.eye(4)
-        for edge, forward in path:
+        for edge, forward in steps:
             step = self._static.get(edge)
             step = self._track(edge).at(stamp_ns) if step is None else step
             if step is None:
@@ -87,22 +90,24 @@ class TransformTree:
             T = T @ (step if forward else se3.inverse(step))
         return T
 
-    def _track(self, edge: tuple[str, str]) -> PoseTrack:
+    def _track(self, edge: Edge) -> PoseTrack:
         if edge not in self._tracks:
             self._tracks[edge] = self._logs[edge].track()
         return self._tracks[edge]
 
-    def _path(
-        self, parent: str, child: str, edges: set[tuple[str, str]]
-    ) -> list[tuple[tuple[str, str], bool]] | None:
-        """Return the edges from parent to child, each with whether it is walked downward."""
-        start, goal = parent.strip("/"), child.strip("/")
-        ways: dict[str, list[tuple[tuple[str, str], bool]]] = {start: []}
-        queue = [start]
-        for frame in queue:
-            for edge in sorted(edges):
-                for here, there, forward in ((edge[0], edge[1], True), (edge[1], edge[0], False)):
-                    if here == frame and there not in ways:
-                        ways[there] = [*ways[frame], (edge, forward)]
-                        queue.append(there)
-        return ways.get(goal)
+
+def way(parent: str, child: str, edges: Iterable[Edge]) -> list[tuple[Edge, bool]] | None:
+    """Return the edges that lead from one frame to another, or None; of several ways a shortest.
+
+    Each comes with whether it is walked downward, from parent to child.
+    """
+    start, goal, ordered = parent.strip("/"), child.strip("/"), sorted(edges)
+    ways: dict[str, list[tuple[Edge, bool]]] = {start: []}
+    queue = [start]
+    for frame in queue:
+        for edge in ordered:
+            for here, there, forward in ((edge[0], edge[1], True), (edge[1], edge[0], False)):
+                if here == frame and there not in ways:
+                    ways[there] = [*ways[frame], (edge, forward)]
+                    queue.append(there)
+    return ways.get(goal)

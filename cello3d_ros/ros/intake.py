@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.ros.odometry import OdometryBuffer, OdometryError, OdometryNotYetError
+from cello3d_ros.ros.frames import UnknownFrameError
+from cello3d_ros.ros.guess import Place
+from cello3d_ros.ros.odometry import OdometryError, OdometryNotYetError
 
 JUMP_NS = (
     1_000_000_000  # a stamp that goes back by more than this is a clock set back, a bag looped
@@ -25,9 +28,9 @@ class Skip:
 
 @dataclass
 class Job:
-    """A cloud on its way: when it came (time.monotonic) and, in the end, where odometry puts it.
+    """A cloud on its way: when it came (time.monotonic) and, in the end, where it was taken.
 
-    points: (N, 3), sensor frame.  T_odom_base: (4, 4), at the stamp.
+    points: (N, 3), sensor frame.
     """
 
     stamp_ns: int
@@ -35,7 +38,7 @@ class Job:
     frame_id: str
     received_s: float
     waited_s: float = 0.0
-    T_odom_base: Array | None = None
+    place: Place | None = None
 
 
 def stamp_order(stamp_ns: int, newest_ns: int | None) -> str:
@@ -55,8 +58,16 @@ class Intake:
     the clouds whose odometry is there the newest is taken and the others are dropped.
     """
 
-    def __init__(self, odometry: OdometryBuffer) -> None:
-        self._odometry = odometry
+    def __init__(
+        self,
+        locate: Callable[[int, str, bool], Place],
+        timeout_s: float,
+        what: str = "odometry",
+    ) -> None:
+        """locate: as Locator.place.  timeout_s: how long a cloud waits for it.  what: it knows."""
+        self._locate = locate
+        self._what = what
+        self.timeout_s = timeout_s
         self._waiting: list[Job] = []
 
     def __len__(self) -> int:
@@ -80,11 +91,11 @@ class Intake:
         for i in reversed(range(len(self._waiting))):
             job = self._waiting[i]
             try:
-                job.T_odom_base = self._odometry.at(job.stamp_ns)
+                job.place = self._place(job)
             except OdometryNotYetError:
                 continue
             except OdometryError as error:
-                skips.append(_without_odometry(job, error))
+                skips.append(self._without_place(job, error))
                 del self._waiting[i]
                 continue
             skips += [_superseded(old) for old in self._waiting[:i]]
@@ -92,8 +103,8 @@ class Intake:
             return job, skips
         return None, skips
 
-    def expire(self, elapsed_s: float, timeout_s: float) -> list[Skip]:
-        """Drop the clouds that have now waited ``timeout_s``.
+    def expire(self, elapsed_s: float) -> list[Skip]:
+        """Drop the clouds that have now waited long enough, unless they can do without odometry.
 
         ``elapsed_s`` counts only time in which odometry could have been heard: a node that was
         busy must not blame the odometry.
@@ -101,21 +112,27 @@ class Intake:
         skips, kept = [], []
         for job in self._waiting:
             job.waited_s += elapsed_s
-            if job.waited_s < timeout_s:
+            if job.waited_s < self.timeout_s:
                 kept.append(job)
                 continue
             try:
-                self._odometry.at(job.stamp_ns)
+                self._place(job)
                 kept.append(job)
             except OdometryError as error:
-                skips.append(_without_odometry(job, error))
+                skips.append(self._without_place(job, error))
         self._waiting = kept
         return skips
+
+    def _place(self, job: Job) -> Place:
+        return self._locate(job.stamp_ns, job.frame_id, job.waited_s >= self.timeout_s)
+
+    def _without_place(self, job: Job, error: OdometryError) -> Skip:
+        if isinstance(error, UnknownFrameError):
+            return Skip(job.stamp_ns, "unknown_frame", str(error))
+        reason = f"no_{self._what.replace(' ', '_')}"
+        sentence = f"no {self._what} at the stamp of the cloud: {error}"
+        return Skip(job.stamp_ns, reason, sentence)
 
 
 def _superseded(job: Job) -> Skip:
     return Skip(job.stamp_ns, "superseded", "a newer cloud came before it could be worked on")
-
-
-def _without_odometry(job: Job, error: OdometryError) -> Skip:
-    return Skip(job.stamp_ns, "no_odometry", f"no odometry at the stamp of the cloud: {error}")

@@ -1,10 +1,11 @@
 """covariance_node: clouds and odometry in, poses with their covariance out.
 
 ``~/relative_pose`` is one registration: the pose of the reading (the cloud with the message's
-stamp) in the frame of the sensor at the reference, the cloud answered before; header.frame_id is
-the frame of the cloud.  ``~/pose`` is the chain of them since its last restart, in the frame of
-the odometry, where it starts without error at the odometry's pose; its errors accumulate and must
-not be fused as if they were independent.  Nothing is published for a cloud without an answer;
+stamp) in the frame of the sensor at the reference, by default the cloud answered before;
+header.frame_id is the frame of the cloud.  ``~/pose`` is the chain of them since its last restart,
+in the frame of the odometry, where it starts without error at the odometry's pose; its errors
+accumulate and must not be fused as if they were independent.  ``~/odometry`` is that chain with
+the velocity of the last registration.  Nothing is published for a cloud without an answer;
 ``/diagnostics`` says why.
 
 This module is the node's life and its wiring: configure loads and warms up, activate listens.
@@ -14,16 +15,18 @@ What is heard goes to the worker (worker.py), its answers to the outputs (output
 from __future__ import annotations
 
 import traceback
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
@@ -32,6 +35,7 @@ from cello3d_ros.covariance.model import Model, load_model, shipped_model_path
 from cello3d_ros.errors import Cello3dError, ConfigError
 from cello3d_ros.ros import parameters
 from cello3d_ros.ros.diagnostics import Statistics
+from cello3d_ros.ros.inputs import Role, Topic, topics
 from cello3d_ros.ros.intake import JUMP_NS, Job, Skip
 from cello3d_ros.ros.life import ManagedNode
 from cello3d_ros.ros.logbook import Logbook
@@ -67,12 +71,13 @@ class CovarianceNode(ManagedNode):
         path = Path(str(self.get_parameter(parameters.MODEL).value) or shipped_model_path())
         self._model = load_model(path)
         config = self._declared(self._model)
+        topics(config.node)  # what is not installed is better missed before the warming up
         self.get_logger().info("warming up; a first start compiles the kernels")
         warm_up(self._model, config)
-        self._statistics = Statistics(path.name, config.node.max_failures)
+        self._statistics = Statistics(path.name)
         self._worker = Worker(self._model, config, self._skip, self._logbook.warn)
         self.configured.callback(self._forget)
-        self._outputs = Outputs(self)
+        self._outputs = Outputs(self, config.node)
         self.configured.callback(self._outputs.destroy)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.configured.callback(self.destroy_publisher, self._diagnostics)
@@ -85,6 +90,7 @@ class CovarianceNode(ManagedNode):
 
     def listen(self) -> None:
         """Start anew: clouds, odometry and what follows from them."""
+        assert self._config is not None
         self._statistics.listen(True)
         self.active.callback(self._statistics.listen, False)
         self.active.callback(self._worker.stop)
@@ -98,16 +104,26 @@ class CovarianceNode(ManagedNode):
         )
         jumps = self.get_clock().create_jump_callback(backward, post_callback=self._on_jump)
         self.active.callback(jumps.unregister)
-        odometry = self.create_subscription(Odometry, "odom", self._on_odometry, _best_effort(200))
-        self.active.callback(self.destroy_subscription, odometry)
-        clouds = self.create_subscription(PointCloud2, "points", self._on_cloud, _best_effort(2))
-        self.active.callback(self.destroy_subscription, clouds)
-        self.get_logger().info(f"listening to {odometry.topic_name} and {clouds.topic_name}")
+        names = [self._hear(topic) for topic in topics(self._config.node)]
+        self.get_logger().info(f"listening to {', '.join(dict.fromkeys(names))}")
+
+    def _hear(self, topic: Topic) -> str:
+        """Subscribe for as long as the node is active; return the full name of the topic."""
+        callback: Callable[[Any], None] = {
+            Role.CLOUD: self._on_cloud,
+            Role.POSE: self._on_pose,
+            Role.REFERENCE: self._on_reference,
+            Role.TRANSFORMS: self._on_transforms,
+            Role.STATIC_TRANSFORMS: self._on_static_transforms,
+        }[topic.role]
+        subscription = self.create_subscription(topic.kind, topic.name, callback, topic.qos)
+        self.active.callback(self.destroy_subscription, subscription)
+        return str(subscription.topic_name)
 
     def _declared(self, model: Model) -> Config:
         if self._defaults is not None:
             parameters.release(self, self._defaults)
-        self._defaults = Config(**{name: getattr(model.pipeline, name) for name in PIPELINE})
+        self._defaults = config_of(model)
         config = parameters.declare(self, self._defaults)
         if config.grid != model.pipeline.grid:
             raise ConfigError(f"parameters grid.* must be the model's, {model.pipeline.grid}")
@@ -122,21 +138,34 @@ class CovarianceNode(ManagedNode):
 
     # what is heard
 
-    def _on_odometry(self, message: Odometry) -> None:
+    def _on_pose(self, message: Odometry | PoseWithCovarianceStamped) -> None:
         self._statistics.counts["odometry"] += 1
-        if not self._worker.hear_odometry(message, self._now_ns()):
+        if not self._worker.hear_pose(message, self._now_ns()):
             self._statistics.counts["odometry_rejected"] += 1
         elif self._worker.has_work:
             self._work_is_there.trigger()
 
+    def _on_transforms(self, message: Any, static: bool = False) -> None:
+        self._worker.hear_transforms(message, static)
+        if self._worker.has_work:
+            self._work_is_there.trigger()
+
+    def _on_static_transforms(self, message: Any) -> None:
+        self._on_transforms(message, static=True)
+
+    def _on_reference(self, message: PointCloud2) -> None:
+        self._worker.hear_reference(message)
+
     def _on_cloud(self, message: PointCloud2) -> None:
-        self._statistics.counts["received"] += 1
+        self._statistics.receive()
         self._worker.hear_cloud(message, self._now_ns())
         if self._worker.has_work:
             self._work_is_there.trigger()
 
     def _expire(self) -> None:
         self._worker.expire(_TICK_S)
+        if self._worker.has_work:  # perhaps one that can do without odometry
+            self._work_is_there.trigger()
 
     def _on_jump(self, jump: TimeJump) -> None:
         self._worker.jump_to(self._now_ns())
@@ -172,8 +201,8 @@ class CovarianceNode(ManagedNode):
 
     def _publish(self, job: Job, answer: Answer) -> None:
         assert self._config is not None
-        C = self._outputs.publish(job, answer, self._worker.odometry_frame, self._config.node)
-        self._statistics.answer(answer, C, job.received_s, self._now_ns())
+        C, verdict = self._outputs.publish(job, answer, self._config.node)
+        self._statistics.answer(answer, C, verdict, job.received_s, self._now_ns())
 
     def _skip(self, skip: Skip) -> None:
         self._statistics.fail(skip.stamp_ns, skip.reason, skip.sentence)
@@ -182,10 +211,14 @@ class CovarianceNode(ManagedNode):
         self._publish_diagnostics()
 
     def _publish_diagnostics(self) -> None:
-        name = f"{self.get_name()}: registration"
+        assert self._config is not None
         self._diagnostics.publish(
             self._statistics.message(
-                name, self._now_ns(), self._worker.n_restarts, self._worker.n_clock_jumps
+                f"{self.get_name()}: registration",
+                self._now_ns(),
+                self._config.node,
+                self._worker.n_restarts,
+                self._worker.n_clock_jumps,
             )
         )
 
@@ -210,11 +243,11 @@ class CovarianceNode(ManagedNode):
         self._warn_of_differences(self._config, self._model)
 
     def _warn_of_differences(self, config: Config, model: Model) -> None:
-        for difference in differences(config, model.pipeline):
+        for difference in differences(config, config_of(model)):
             self.get_logger().warning(f"not as the model was trained: {difference}")
 
 
-def _best_effort(depth: int) -> QoSProfile:
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT, depth=depth
-    )
+def config_of(model: Model) -> Config:
+    """Return the settings that a model was trained with, and the defaults of all others."""
+    sections = {name: getattr(model.pipeline, name) for name in PIPELINE}
+    return Config(**sections, sampling=model.sampling)

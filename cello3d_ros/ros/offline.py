@@ -12,11 +12,11 @@ from typing import NamedTuple
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry import se3
-from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings.bag import BagRecording
 from cello3d_ros.recordings.odometry import with_odometry
 from cello3d_ros.recordings.recording import Recording, Scan
-from cello3d_ros.ros.odometry import OdometryBuffer, OdometryError
+from cello3d_ros.ros.guess import EXTERNAL, ODOMETRY, Locator, Place
+from cello3d_ros.ros.odometry import OdometryBuffer, OdometryError, PoseSource
 from cello3d_ros.ros.tracker import Answer, Tracker, reason_of
 
 
@@ -31,41 +31,45 @@ class Step(NamedTuple):
 
 def replay(recording: Recording, tracker: Tracker, config: NodeConfig) -> Iterator[Step]:
     """Yield the fate of every cloud; the first one's reason is "reference"."""
-    T_base_sensor = se3.pose(config.T_base_sensor[:3], config.T_base_sensor[3:])
-    for scan, T_odom_base in _with_odometry(recording, config):
-        if not isinstance(T_odom_base, OdometryError):
-            yield _step(scan, T_odom_base @ T_base_sensor, tracker)
+    for scan, place in _places(recording, config):
+        if isinstance(place, Place):
+            yield _step(scan, place, tracker)
         else:
-            sentence = f"no odometry at the stamp of the cloud: {T_odom_base}"
+            sentence = f"no odometry at the stamp of the cloud: {place}"
             yield Step(scan, None, "no_odometry", sentence)
 
 
-def _step(scan: Scan, T_odom_sensor: Array, tracker: Tracker) -> Step:
+def _step(scan: Scan, place: Place, tracker: Tracker) -> Step:
     try:
-        answer = tracker.step(scan.stamp_ns, scan.points, T_odom_sensor)
+        answer = tracker.step(scan.stamp_ns, scan.points, place)
     except Cello3dError as error:
         return Step(scan, None, reason_of(error), str(error))
     return Step(scan, answer, "" if answer is not None else "reference")
 
 
-def _with_odometry(
+def _places(
     recording: Recording, config: NodeConfig
-) -> Iterator[tuple[Scan, Array | OdometryError]]:
-    """Yield each scan with its odometry: a bag's messages as they are, else made of the poses."""
+) -> Iterator[tuple[Scan, Place | OdometryError]]:
+    """Yield each scan with its place: by a bag's messages as they are, else made of the poses.
+
+    They are taken as registrations when ``registration`` is external.
+    """
+    source = PoseSource(OdometryBuffer(config.odometry_buffer_s, config.odometry_gap_s))
+    locator = Locator(config, source)
     if not isinstance(recording, BagRecording) or recording.topics.odometry is None:
+        guess = EXTERNAL if config.registration == "external" else ODOMETRY
+        X = se3.pose(config.T_base_sensor[:3], config.T_base_sensor[3:])
         for scan in with_odometry(recording):
-            assert scan.T_odom_sensor is not None
-            yield scan, scan.T_odom_sensor
+            yield scan, Place(scan.T_odom_sensor, X, guess=guess)
         return
     messages = recording.odometry()
-    buffer = OdometryBuffer(config.odometry_buffer_s, config.odometry_gap_s)
     for scan in recording:
-        while buffer.newest_ns is None or buffer.newest_ns < scan.stamp_ns:
+        while source.poses.newest_ns is None or source.poses.newest_ns < scan.stamp_ns:
             message = next(messages, None)
             if message is None:
                 break
-            buffer.add(*message)
+            source.hear(*message, "odom", "", config.max_odometry_speed_m_s)
         try:
-            yield scan, buffer.at(scan.stamp_ns)
+            yield scan, locator.place(scan.stamp_ns, "lidar", is_late=True)
         except OdometryError as error:
             yield scan, error

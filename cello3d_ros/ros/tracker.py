@@ -6,17 +6,28 @@ decided here; registration and covariance are one call of the estimator.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cello3d_ros.clouds.shape import Cloud, prepare
+from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import NodeConfig, Pipeline
-from cello3d_ros.covariance.estimator import Estimate, estimate
+from cello3d_ros.covariance.estimator import Estimate, estimate, registered_elsewhere
+from cello3d_ros.covariance.methods import METHODS, MethodSettings
 from cello3d_ros.covariance.model import Model
+from cello3d_ros.covariance.novelty import rho_limit
 from cello3d_ros.errors import CloudError, ModelError, NoOverlapError, RegistrationError
-from cello3d_ros.geometry.gaussian import compound_right, is_positive_definite
+from cello3d_ros.geometry.gaussian import GaussianPose, compound_right, is_positive_definite
 from cello3d_ros.geometry.se3 import Array, inverse
+from cello3d_ros.ros.covariances import CovarianceError
+from cello3d_ros.ros.frames import seen_from_base
+from cello3d_ros.ros.guess import CONSTANT_VELOCITY, EXTERNAL, ODOMETRY, Motion, Place
+from cello3d_ros.ros.pairing import Frame, Link, Map, makes_keyframe
+
+#: Names of METHODS by ``node.covariance_mode``.
+METHOD_OF = {"cello3d": "model"} | {name: name for name in METHODS}
+
+_ORIGIN = np.eye(4)
 
 
 class NotConvergedError(RegistrationError):
@@ -27,20 +38,21 @@ class TooFarApartError(RegistrationError):
     """Two scans are too far apart in time to be a pair."""
 
 
-@dataclass(frozen=True)
-class Frame:
-    """A prepared scan and the odometry at its stamp."""
+class BrokenChainError(RegistrationError):
+    """Frames or odometry have changed, so that a scan cannot be paired with those before it."""
 
-    stamp_ns: int
-    cloud: Cloud
-    T_odom_sensor: Array
+
+class NoReferenceError(RegistrationError):
+    """No reference cloud has come."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """One registration and the chain that ends with it.
+    """One registration and the chain that ends with it, as they are published.
 
     T_odom_read: (4, 4), the accumulated pose; its covariance Y_chain: (6, 6), reading side.
+    frame_id, pose_frame_id: the frames of the registration and of the accumulated pose;
+    child_frame_id: whose pose they are.  guess: where the first guess came from.
     """
 
     stamp_ns: int
@@ -48,80 +60,214 @@ class Answer:
     estimate: Estimate
     T_odom_read: Array
     Y_chain: Array
+    frame_id: str = "lidar"
+    pose_frame_id: str = "odom"
+    child_frame_id: str = "lidar"
+    guess: str = ODOMETRY
 
 
 class Tracker:
-    """Pairs each scan with the one before and accumulates the poses."""
+    """Pairs each scan with the one before, a keyframe or a map, and accumulates the poses."""
 
     def __init__(self, model: Model, pipeline: Pipeline, config: NodeConfig) -> None:
         self.model, self.pipeline, self.config = model, pipeline, config
+        self._rho_limit = rho_limit(model, config.unknown_quantile)
         self.n_failures = 0  # in a row, against the present reference
         self.n_restarts = 0
-        self._reference: Frame | None = None
-        self.reset()
+        self.last_restart = ""
+        self._map: Map | None = None
+        self._reference: Link | None = None
+        self._latest: Link | None = None
+        self._motion = Motion()
+        self._T_map_odom: Array = _ORIGIN
 
-    def reset(self) -> None:
-        """Forget the reference and the chain; the next scan starts anew."""
-        self.n_restarts += self._reference is not None
-        self._reference = None
-        self._T_odom_ref: Array = np.eye(4)
-        self._Y_chain: Array = np.zeros((6, 6))
+    @property
+    def map_stamp_ns(self) -> int | None:
+        """Stamp of the reference cloud that came last, or None."""
+        return None if self._map is None else self._map.stamp_ns
+
+    def reset(self, reason: str = "") -> None:
+        """Forget the reference and the chain; the next scan starts anew.  A map stays."""
+        if self._reference is not None:
+            self.n_restarts += 1
+            self.last_restart = reason
+        self._reference = self._latest = None
+        self._motion = Motion()
+        self._T_map_odom = _ORIGIN
         self.n_failures = 0
 
-    def step(self, stamp_ns: int, points: Array, T_odom_sensor: Array) -> Answer | None:
-        """Register a scan to the reference; it becomes the reference.
+    def take_map(self, stamp_ns: int, points: Array, frame_id: str) -> None:
+        """Register scans to this cloud from now on.  points: (N, 3), in the frame ``frame_id``."""
+        if self._map is None or self._map.frame_id != frame_id:
+            self.reset("the frame of the reference cloud changed")
+        self._map = Map(stamp_ns, points, frame_id)
 
-        points: (N, 3), sensor frame.  Returns None for the first scan, which only is a reference.
+    def step(self, stamp_ns: int, points: Array, place: Place) -> Answer | None:
+        """Register a scan to the reference; it becomes the reference, or not, by ``pairing``.
+
+        points: (N, 3), sensor frame.  Returns None for a scan that only starts a chain.
         Raises CloudError, RegistrationError or ModelError (the pair is beyond the model) when
         there is no answer: the reference stays, until ``max_failures`` scans in a row have failed
         against it; then the chain starts again at the last of them.
         """
         rng = np.random.default_rng([self.config.seed, stamp_ns & (2**64 - 1)])
-        frame = Frame(stamp_ns, prepare(points, self.pipeline.cloud, rng), T_odom_sensor)
-        if self._reference is None:
+        cloud = prepare(points, self.pipeline.cloud, rng)
+        frame = Frame(stamp_ns, cloud, place, place.T_odom_sensor)
+        if self._latest is not None:
+            frame = self._in_chain(frame, self._latest.frame)
+        if self.config.pairing == "topics":
+            self._reference = self._map_around(frame)
+        elif self._reference is None:
             self._start_at(frame)
             return None
-        gap_s = 1e-9 * (stamp_ns - self._reference.stamp_ns)
-        if gap_s > self.config.max_pair_gap_s:
-            self._restart_at(frame)
-            raise TooFarApartError(
-                f"the scan comes {gap_s:.1f} s after the one before it, more than "
-                f"{self.config.max_pair_gap_s:g} s: the chain starts again here"
-            )
+        reference = self._reference
         try:
-            answer = self._answer(frame, self._reference, rng)
+            answer = self._answer(frame, reference, rng)
         except (RegistrationError, ModelError):
             self._fail(frame)
             raise
-        self._reference, self.n_failures = frame, 0
-        self._T_odom_ref, self._Y_chain = answer.T_odom_read, answer.Y_chain
-        return answer
+        self._accept(frame, answer, reference)
+        return self._published(answer, place, reference)
 
-    def _answer(self, reading: Frame, reference: Frame, rng: np.random.Generator) -> Answer:
-        T_init = inverse(reference.T_odom_sensor) @ reading.T_odom_sensor
-        found = estimate(reading.cloud, reference.cloud, T_init, self.model, self.pipeline, rng)
+    def _in_chain(self, frame: Frame, before: Frame) -> Frame:
+        """Return a scan that can follow the one before; else start the chain at it and raise.
+
+        A map is still where it was when odometry is not: then the guess does without odometry.
+        """
+        to_map = self.config.pairing == "topics"
+        gap_s = 1e-9 * (frame.stamp_ns - before.stamp_ns)
+        error: RegistrationError
+        if broken := _broken(before.place, frame.place):
+            if to_map:
+                is_external = frame.place.guess == EXTERNAL
+                return frame if is_external else replace(frame, T_odom_sensor=None)
+            error = BrokenChainError(f"{broken}: the chain starts again here")
+        elif gap_s > self.config.max_pair_gap_s and not to_map:
+            error = TooFarApartError(
+                f"the scan comes {gap_s:.1f} s after the one before it, more than "
+                f"{self.config.max_pair_gap_s:g} s: the chain starts again here"
+            )
+        else:
+            return frame
+        self._restart_at(frame, str(error))
+        raise error
+
+    def _map_around(self, frame: Frame) -> Link:
+        """Return the part of the map around the first guess of the sensor as a reference."""
+        if self._map is None:
+            raise NoReferenceError("no cloud has been received on reference_points")
+        given = frame.place.T_map_odom
+        T_map_odom = self._T_map_odom if given is None else given
+        if frame.T_odom_sensor is None:
+            T_map_sensor = self._motion.at(frame.stamp_ns)
+        else:
+            T_map_sensor = T_map_odom @ frame.T_odom_sensor
+        cloud, T_map_crop = self._map.around(
+            T_map_sensor[:3, 3],
+            self.config.reference_range_m,
+            self.pipeline.cloud,
+            self.config.seed,
+        )
+        T_odom_crop = inverse(T_map_odom) @ T_map_crop
+        crop = Frame(self._map.stamp_ns, cloud, frame.place, T_odom_crop)
+        return Link(crop, T_map_crop, np.zeros((6, 6)))
+
+    def _answer(self, reading: Frame, reference: Link, rng: np.random.Generator) -> Answer:
+        T_init, guess = self._guess(reading, reference)
+        found = estimate(
+            *(reading.cloud, reference.frame.cloud, T_init, self.model, self.pipeline, rng),
+            method=METHOD_OF[self.config.covariance_mode],
+            settings=self._settings(),
+            registration=registered_elsewhere(T_init) if guess == EXTERNAL else None,
+        )
         if not found.registration.converged:
             raise NotConvergedError(
                 f"ICP did not converge in {found.registration.n_iterations} iterations "
                 f"({found.registration.reason})"
             )
-        T, Y = _extended(
-            self._T_odom_ref, self._Y_chain, found.registration.T_ref_read, found.covariance
+        T, Y = _extended(reference.T, reference.Y, found.registration.T_ref_read, found.covariance)
+        return Answer(reading.stamp_ns, reference.frame.stamp_ns, found, T, Y, guess=guess)
+
+    def _guess(self, reading: Frame, reference: Link) -> tuple[Array, str]:
+        """Return the first guess of T_ref_read and where it comes from."""
+        T_odom_ref, T_odom_read = reference.frame.T_odom_sensor, reading.T_odom_sensor
+        if T_odom_ref is not None and T_odom_read is not None:
+            return inverse(T_odom_ref) @ T_odom_read, reading.place.guess
+        return inverse(reference.T) @ self._motion.at(reading.stamp_ns), CONSTANT_VELOCITY
+
+    def _accept(self, frame: Frame, answer: Answer, reference: Link) -> None:
+        """Take an answered scan into the chain, and as the next reference if it is one."""
+        place = frame.place
+        T_ref_read = answer.estimate.registration.T_ref_read
+        T_odom_ref = reference.frame.T_odom_sensor
+        if place.guess not in (ODOMETRY, EXTERNAL) and T_odom_ref is not None:
+            frame = replace(frame, T_odom_sensor=T_odom_ref @ T_ref_read)
+        self._latest = Link(frame, answer.T_odom_read, answer.Y_chain)
+        self._motion.add(frame.stamp_ns, answer.T_odom_read)
+        self.n_failures = 0
+        if self.config.pairing == "topics":
+            if place.guess == ODOMETRY and place.T_odom_sensor is not None:
+                self._T_map_odom = answer.T_odom_read @ inverse(place.T_odom_sensor)
+        elif self.config.pairing == "consecutive" or makes_keyframe(
+            T_ref_read, answer.estimate.overlap_ratio, self.config
+        ):
+            self._reference = self._latest
+
+    def _published(self, answer: Answer, place: Place, reference: Link) -> Answer:
+        """Return an answer in the frames in which it is published."""
+        base = self.config.output_frame == "base"
+        child = place.base_frame if base else place.sensor_frame
+        found = answer.estimate
+        T, X_ref = found.registration.T_ref_read, reference.frame.place.T_base_sensor
+        frame_id, pose_frame_id = child, place.odom_frame
+        if self.config.pairing == "topics" and self._map is not None:
+            T, X_ref = answer.T_odom_read, _ORIGIN
+            frame_id = pose_frame_id = self._map.frame_id
+        step = GaussianPose(T, found.covariance)
+        pose = GaussianPose(answer.T_odom_read, answer.Y_chain)
+        if base:
+            X = place.T_base_sensor
+            step = seen_from_base(*step, X_ref, X)
+            pose = seen_from_base(*pose, _ORIGIN, X)
+        registration = found.registration._replace(T_ref_read=step.T)
+        return replace(
+            answer,
+            estimate=found._replace(registration=registration, covariance=step.Y),
+            T_odom_read=pose.T,
+            Y_chain=pose.Y,
+            frame_id=frame_id,
+            pose_frame_id=pose_frame_id,
+            child_frame_id=child,
         )
-        return Answer(reading.stamp_ns, reference.stamp_ns, found, T, Y)
+
+    def _settings(self) -> MethodSettings:
+        config = self.config
+        return MethodSettings(
+            sigma_m=config.sensor_sigma_m,
+            n_registrations=config.n_registrations,
+            rho_limit=self._rho_limit,
+            widen_unknown=config.inflate_unknown,
+            scale=config.scale,
+        )
 
     def _fail(self, frame: Frame) -> None:
         self.n_failures += 1
         if self.n_failures >= self.config.max_failures:
-            self._restart_at(frame)
+            self._restart_at(frame, f"{self.n_failures} failures in a row")
+        elif self.config.pairing == "keyframe":
+            self._reference = self._latest  # the keyframe may be too far away by now
 
-    def _restart_at(self, frame: Frame) -> None:
-        self.n_restarts += 1
-        self._start_at(frame)
+    def _restart_at(self, frame: Frame, reason: str) -> None:
+        T_odom_sensor = self._motion.at(frame.stamp_ns)
+        self.reset(reason)
+        if self.config.pairing != "topics":
+            self._start_at(frame, T_odom_sensor)
 
-    def _start_at(self, frame: Frame) -> None:
-        self._reference, self.n_failures = frame, 0
-        self._T_odom_ref, self._Y_chain = frame.T_odom_sensor, np.zeros((6, 6))
+    def _start_at(self, frame: Frame, T_predicted: Array = _ORIGIN) -> None:
+        """Begin a chain where odometry puts the frame or, without it, where it is expected."""
+        T = T_predicted if frame.T_odom_sensor is None else frame.T_odom_sensor
+        self._reference = self._latest = Link(frame, T, np.zeros((6, 6)))
+        self._motion.add(frame.stamp_ns, T)
 
 
 def reason_of(error: Exception) -> str:
@@ -129,12 +275,27 @@ def reason_of(error: Exception) -> str:
     names = {
         NotConvergedError: "not_converged",
         TooFarApartError: "too_far_apart",
+        BrokenChainError: "broken_chain",
+        NoReferenceError: "no_reference",
         NoOverlapError: "no_overlap",
         RegistrationError: "registration",
         ModelError: "beyond_model",
         CloudError: "too_few_points",
+        CovarianceError: "covariance",
     }
     return next((name for kind, name in names.items() if isinstance(error, kind)), "internal")
+
+
+def _broken(before: Place, now: Place) -> str:
+    """Return why a scan cannot follow another, or ""."""
+    for what, old, new in (
+        ("frame_id of the clouds", before.sensor_frame, now.sensor_frame),
+        ("frame of the odometry", before.odom_frame, now.odom_frame),
+        ("child frame of the odometry", before.base_frame, now.base_frame),
+    ):
+        if old != new:
+            return f"the {what} changed from {old!r} to {new!r}"
+    return "" if before.epoch == now.epoch else "the odometry jumped or began anew"
 
 
 def _extended(T: Array, Y: Array, T_step: Array, Y_step: Array) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from cello3d_ros.config import Config
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry.se3 import Array, exp, inverse, transform
+from cello3d_ros.ros.guess import Place
 from cello3d_ros.ros.tracker import Tracker
 
 
@@ -23,12 +25,12 @@ def room(rng: np.random.Generator, n_points: int = 4000, size_m: float = 6.0) ->
 def warm_up(model: Model, config: Config) -> None:
     """Answer one pair of scans of a simulated room, whatever the settings make of them."""
     rng = np.random.default_rng(0)
-    tracker = Tracker(model, config, config.node)
+    tracker = Tracker(model, config, replace(config.node, pairing="consecutive"))
     step = exp([0.1, 0.0, 0.0, 0.0, 0.0, 0.02])
     points = room(rng)
     for stamp_ns, T in enumerate((np.eye(4), step)):
         with contextlib.suppress(Cello3dError):
-            tracker.step(stamp_ns, transform(inverse(T), points), T)
+            tracker.step(stamp_ns, transform(inverse(T), points), Place(T))
 
 
 def _box(rng: np.random.Generator, n_points: int, size: Array) -> Array:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 
@@ -16,19 +18,20 @@ from cello3d_ros.clouds.pointcloud2 import read_points
 from cello3d_ros.config import Config
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import CloudError
-from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.ros import messages
+from cello3d_ros.ros.frames import TransformBuffer
+from cello3d_ros.ros.guess import Locator
 from cello3d_ros.ros.intake import JUMP_NS, Intake, Job, Skip, stamp_order
-from cello3d_ros.ros.odometry import OdometryBuffer, OdometryError
+from cello3d_ros.ros.odometry import OdometryBuffer, OdometryError, PoseSource
 from cello3d_ros.ros.tracker import Answer, Tracker
 
 
 class Worker:
-    """Hears odometry and clouds, chooses the cloud to work on and registers it.
+    """Hears poses and clouds, chooses the cloud to work on and registers it.
 
     ``skip`` is called for each cloud that will have no answer, ``warn`` with a kind and a sentence
-    for what else is wrong.  ``odometry_frame`` is the frame of the odometry heard last.
+    for what else is wrong.
     """
 
     def __init__(
@@ -40,12 +43,15 @@ class Worker:
     ) -> None:
         node = config.node
         self.config = config
-        self.odometry_frame = "odom"
         self.n_clock_jumps = 0
         self._skip, self._warn = skip, warn
-        self._odometry = OdometryBuffer(node.odometry_buffer_s, node.odometry_gap_s)
-        self._T_base_sensor = se3.pose(node.T_base_sensor[:3], node.T_base_sensor[3:])
-        self._intake = Intake(self._odometry)
+        length_s, gap_s = node.odometry_buffer_s, node.odometry_gap_s
+        what = "external pose" if node.registration == "external" else "odometry"
+        self._poses = OdometryBuffer(length_s, gap_s, what=what)
+        self._source = PoseSource(self._poses)
+        self._transforms = TransformBuffer(length_s, gap_s) if node.use_tf else None
+        self._locator = Locator(node, self._source, self._transforms)
+        self._intake = Intake(self._locator.place, node.odometry_timeout_s, what)
         self._newest_cloud_ns: int | None = None
         self._tracker = Tracker(model, config, node)
 
@@ -63,22 +69,47 @@ class Worker:
         """Take the settings that may change while clouds come."""
         self.config = config
         self._tracker.pipeline, self._tracker.config = config, config.node
-        self._odometry.gap_s = config.node.odometry_gap_s
+        self._locator.config = config.node
+        self._intake.timeout_s = config.node.odometry_timeout_s
+        self._poses.gap_s = config.node.odometry_gap_s
 
-    def hear_odometry(self, message: Odometry, now_ns: int) -> bool:
-        """Remember a pose of the base; False when it was rejected."""
-        stamp_ns = messages.stamp_ns_of(message)
+    def hear_pose(self, message: Odometry | PoseWithCovarianceStamped, now_ns: int) -> bool:
+        """Remember a pose of odometry or of the external registration; False if rejected."""
+        stamp_ns, what = messages.stamp_ns_of(message), self._poses.what
         try:
             self._check_not_in_future(stamp_ns, now_ns)
             T = messages.pose_from(message.pose.pose)
-            if stamp_order(stamp_ns, self._odometry.newest_ns) == "jump":
+            if stamp_order(stamp_ns, self._poses.newest_ns) == "jump":
                 self.jump_to(stamp_ns)
-            self._odometry.add(stamp_ns, T)
+            frames = message.header.frame_id, getattr(message, "child_frame_id", "")
+            fastest = self.config.node.max_odometry_speed_m_s
+            if broken := self._source.hear(stamp_ns, T, *frames, fastest):
+                self._warn("broken_chain", f"{broken}: the chain starts again")
         except OdometryError as error:
-            self._warn("odometry", f"odometry message rejected: {error}")
+            self._warn("odometry", f"{what} message rejected: {error}")
             return False
-        self.odometry_frame = message.header.frame_id or "odom"
         return True
+
+    def hear_transforms(self, message: Any, static: bool) -> None:
+        """Remember the transforms of a tf2_msgs/TFMessage."""
+        if self._transforms is not None:
+            for sentence in self._transforms.hear(message, static):
+                self._warn("transform", sentence)
+
+    def hear_reference(self, message: PointCloud2) -> None:
+        """Register to this cloud from now on; one that comes twice is the same one."""
+        stamp_ns, frame_id = messages.stamp_ns_of(message), message.header.frame_id
+        if self._tracker.map_stamp_ns == stamp_ns and self._locator.map_frame == frame_id:
+            return
+        try:
+            points = read_points(message)
+            if not frame_id or not len(points):
+                raise CloudError("it has no frame_id" if not frame_id else "it has no points")
+        except Exception as error:  # whatever bytes may do, the node outlives them
+            self._warn("reference", f"reference cloud rejected: {error}")
+            return
+        self._locator.map_frame = frame_id
+        self._tracker.take_map(stamp_ns, points, frame_id)
 
     def hear_cloud(self, message: PointCloud2, now_ns: int) -> None:
         """Let a cloud wait for its odometry, or drop it."""
@@ -103,38 +134,41 @@ class Worker:
 
         Raises Cello3dError when there is no answer.
         """
-        assert job.T_odom_base is not None
-        T_odom_sensor = job.T_odom_base @ self._T_base_sensor
-        return self._tracker.step(job.stamp_ns, job.points, T_odom_sensor)
+        assert job.place is not None
+        return self._tracker.step(job.stamp_ns, job.points, job.place)
 
     def expire(self, elapsed_s: float) -> None:
         """Drop the clouds that have waited too long for their odometry."""
-        for skip in self._intake.expire(elapsed_s, self.config.node.odometry_timeout_s):
+        for skip in self._intake.expire(elapsed_s):
             self._skip(skip)
 
     def jump_to(self, stamp_ns: int) -> None:
         """Time has jumped back to ``stamp_ns``: forget what now lies in the future."""
         self.n_clock_jumps += 1
         self._warn("clock_jump", "time jumped back: everything remembered is forgotten")
-        newest_ns = self._odometry.newest_ns
+        newest_ns = self._poses.newest_ns
         if newest_ns is not None and newest_ns - stamp_ns > JUMP_NS:
-            self._odometry.clear()
+            self._poses.clear()
+        if self._transforms is not None:
+            self._transforms.clear()
         self._forget("clock_jump", "time jumped back while it waited")
 
     def stop(self) -> None:
         """Nothing more will be heard for a while: forget everything."""
-        self._odometry.clear()
+        self._poses.clear()
+        if self._transforms is not None:
+            self._transforms.clear()
         self._forget("deactivated", "the node was deactivated while it waited")
 
     def reset(self) -> None:
         """Forget the reference and the chain; the next cloud starts anew."""
-        self._tracker.reset()
+        self._tracker.reset("it was told to")
 
     def _forget(self, reason: str, sentence: str) -> None:
         for skip in self._intake.clear(reason, sentence):
             self._skip(skip)
         self._newest_cloud_ns = None
-        self._tracker.reset()
+        self._tracker.reset(sentence)
 
     def _admitted(self, stamp_ns: int, message: PointCloud2, now_ns: int) -> Array | Skip:
         """Return the points of a cloud in its turn; a damaged one does not move the clock."""

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from cello3d_ros.config import NodeConfig
+from cello3d_ros.ros.frames import TransformBuffer
+from cello3d_ros.ros.guess import Locator
 from cello3d_ros.ros.intake import Intake, Job, Skip, stamp_order
-from cello3d_ros.ros.odometry import OdometryBuffer
+from cello3d_ros.ros.odometry import OdometryBuffer, PoseSource
 
 S = 1_000_000_000
 
@@ -18,6 +21,12 @@ def odometry(*stamps: int) -> OdometryBuffer:
     for stamp_ns in stamps:
         buffer.add(stamp_ns, np.eye(4))
     return buffer
+
+
+def intake_of(buffer: OdometryBuffer, timeout_s: float = 0.5, **settings) -> Intake:
+    """An intake whose clouds are placed by odometry as the settings have it."""
+    source = PoseSource(buffer)
+    return Intake(Locator(NodeConfig(**settings), source).place, timeout_s)
 
 
 @pytest.mark.parametrize(
@@ -37,19 +46,19 @@ def test_order_of_stamps(stamp_ns: int, expected: str) -> None:
 
 def test_a_cloud_waits_for_its_odometry_and_then_comes_out_with_it() -> None:
     buffer = odometry(S)
-    intake = Intake(buffer)
+    intake = intake_of(buffer)
     assert intake.offer(job(S + S // 2)) == []
     assert intake.take() == (None, [])
     buffer.add(2 * S, np.eye(4))
     taken, skips = intake.take()
     assert taken is not None
     assert taken.stamp_ns == S + S // 2
-    np.testing.assert_array_equal(taken.T_odom_base, np.eye(4))
+    np.testing.assert_array_equal(taken.place.T_odom_sensor, np.eye(4))
     assert (skips, len(intake)) == ([], 0)
 
 
 def test_the_newest_cloud_wins_and_the_older_is_counted() -> None:
-    intake = Intake(odometry(S, 2 * S, 3 * S))
+    intake = intake_of(odometry(S, 2 * S, 3 * S))
     intake.offer(job(S))
     intake.offer(job(2 * S))
     taken, skips = intake.take()
@@ -59,7 +68,7 @@ def test_the_newest_cloud_wins_and_the_older_is_counted() -> None:
 
 
 def test_a_newer_cloud_without_odometry_does_not_hold_up_the_older() -> None:
-    intake = Intake(odometry(S))
+    intake = intake_of(odometry(S))
     intake.offer(job(S))
     intake.offer(job(2 * S))
     taken, skips = intake.take()
@@ -70,7 +79,7 @@ def test_a_newer_cloud_without_odometry_does_not_hold_up_the_older() -> None:
 
 def test_odometry_late_by_many_periods_starves_nobody() -> None:
     buffer = odometry(0)
-    intake = Intake(buffer)
+    intake = intake_of(buffer)
     answered = []
     for i in range(1, 40):  # ten clouds a second, odometry half a second late
         intake.offer(job(i * S // 10))
@@ -84,14 +93,14 @@ def test_odometry_late_by_many_periods_starves_nobody() -> None:
 
 
 def test_never_more_than_two_wait_and_every_displaced_cloud_is_counted() -> None:
-    intake = Intake(odometry())
+    intake = intake_of(odometry())
     skips = [skip for i in range(10) for skip in intake.offer(job(i * S))]
     assert len(intake) == 2
     assert [skip.stamp_ns // S for skip in skips] == list(range(1, 9))
 
 
 def test_a_cloud_older_than_all_odometry_is_skipped_at_once() -> None:
-    intake = Intake(odometry(5 * S))
+    intake = intake_of(odometry(5 * S))
     intake.offer(job(S))
     taken, skips = intake.take()
     assert taken is None
@@ -101,24 +110,53 @@ def test_a_cloud_older_than_all_odometry_is_skipped_at_once() -> None:
 
 
 def test_a_cloud_expires_after_the_timeout_of_listening() -> None:
-    intake = Intake(odometry(S))
+    intake = intake_of(odometry(S))
     intake.offer(job(2 * S))
-    assert intake.expire(0.25, 0.5) == []
-    skips = intake.expire(0.25, 0.5)
+    assert intake.expire(0.25) == []
+    skips = intake.expire(0.25)
     assert [skip.reason for skip in skips] == ["no_odometry"]
     assert "1.000 s older" in skips[0].sentence
     assert len(intake) == 0
 
 
 def test_a_cloud_whose_odometry_has_come_does_not_expire() -> None:
-    intake = Intake(odometry(S))
+    intake = intake_of(odometry(S))
     intake.offer(job(S))
-    assert intake.expire(10.0, 0.5) == []
+    assert intake.expire(10.0) == []
     assert intake.take()[0] is not None
 
 
 def test_clear_names_what_it_forgot() -> None:
-    intake = Intake(odometry())
+    intake = intake_of(odometry())
     intake.offer(job(S))
     assert intake.clear("clock_jump", "time jumped") == [Skip(S, "clock_jump", "time jumped")]
     assert len(intake) == 0
+
+
+def test_a_cloud_that_can_do_without_odometry_is_taken_when_it_has_waited() -> None:
+    intake = intake_of(odometry(S), guess_without_odometry="constant_velocity")
+    intake.offer(job(2 * S))
+    assert intake.take() == (None, [])
+    assert intake.expire(0.25) == []
+    assert intake.take() == (None, [])
+    assert intake.expire(0.25) == []
+    taken, _ = intake.take()
+    assert taken is not None
+    assert taken.place.guess == "constant_velocity"
+
+
+def test_a_missing_external_pose_and_an_unknown_frame_are_counted_apart() -> None:
+    poses = OdometryBuffer(100.0, 1.0, what="external pose")
+    where = Locator(NodeConfig(registration="external"), PoseSource(poses))
+    intake = Intake(where.place, 0.5, "external pose")
+    intake.offer(job(S))
+    (skip,) = intake.expire(0.5)
+    assert (skip.reason, skip.sentence) == (
+        "no_external_pose",
+        "no external pose at the stamp of the cloud: no external pose has been received",
+    )
+    poses.add(S, np.eye(4))
+    where.transforms = TransformBuffer(10.0, 1.0)
+    intake.offer(job(S))
+    (skip,) = intake.expire(0.5)
+    assert skip.reason == "unknown_frame"

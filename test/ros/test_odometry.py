@@ -1,6 +1,7 @@
 """Odometry buffer: interpolation, order, gaps."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from cello3d_ros.ros.odometry import (
     OdometryError,
     OdometryMissingError,
     OdometryNotYetError,
+    PoseSource,
     checked_pose,
 )
 
@@ -111,3 +113,50 @@ def test_a_rounded_quaternion_is_accepted_as_a_rotation() -> None:
 def test_a_pose_that_is_not_rigid_is_rejected() -> None:
     with pytest.raises(OdometryError, match="not rigid"):
         buffer_of((S, np.diag([2.0, 2.0, 2.0, 1.0])))
+
+
+def source() -> PoseSource:
+    """A source that has heard two poses a tenth of a second apart."""
+    poses = PoseSource(OdometryBuffer(10.0, 1.0))
+    assert poses.epoch == 0
+    for k in range(2):
+        sentence = poses.hear(S + k * S // 10, shifted(0.1 * k), "odom", "base_link", 20.0)
+        assert sentence == ""
+    assert poses.epoch == 1
+    return poses
+
+
+def shifted(x: float) -> np.ndarray:
+    return se3.exp([x, 0, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("x", "frame_id", "child_frame_id", "sentence"),
+    [
+        (10.1, "odom", "base_link", r"jumped: 100\.0 m/s, more than 20 m/s"),
+        (0.2, "map", "base_link", "frame_id of the odometry changed from 'odom' to 'map'"),
+        (0.2, "odom", "lidar", "child_frame_id of the odometry changed from 'base_link' to"),
+    ],
+)
+def test_a_jump_or_a_change_of_frames_begins_an_epoch(x, frame_id, child_frame_id, sentence):
+    poses = source()
+    assert re.search(sentence, poses.hear(S + S // 5, shifted(x), frame_id, child_frame_id, 20.0))
+    assert (poses.epoch, poses.frame_id, poses.child_frame_id) == (2, frame_id, child_frame_id)
+    with pytest.raises(OdometryMissingError):  # nothing is interpolated across it
+        poses.poses.at(S + 3 * S // 20)
+    assert poses.hear(S + 3 * S // 10, shifted(x + 1.0), frame_id, child_frame_id, 20.0) == ""
+    assert poses.epoch == 2
+
+
+def test_fast_but_steady_odometry_has_not_jumped() -> None:
+    poses = source()
+    assert poses.hear(S + S // 5, shifted(2.0), "odom", "base_link", 20.0) == ""
+    assert poses.hear(S + S // 5 + 1000, shifted(2.1), "odom", "base_link", 20.0) == ""
+    assert poses.epoch == 1
+
+
+def test_a_late_pose_of_another_frame_changes_nothing() -> None:
+    poses = source()
+    with pytest.raises(OdometryError):
+        poses.hear(S, shifted(90.0), "map", "other", 20.0)
+    assert (poses.epoch, poses.frame_id, len(poses.poses)) == (1, "odom", 2)

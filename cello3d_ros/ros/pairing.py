@@ -1,0 +1,89 @@
+"""What a cloud is registered to: a scan of the chain, or a map.  Imports no ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cello3d_ros.clouds.shape import Cloud, prepare
+from cello3d_ros.config import CloudConfig, NodeConfig
+from cello3d_ros.errors import CloudError, NoOverlapError
+from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.ros.guess import Place
+
+_MOVED = 0.25  # share of the range after which the map is cropped anew
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A prepared scan and where its sensor was.
+
+    T_odom_sensor: (4, 4), in the frame of the odometry, as it says or, without it, as the
+    registration made of it; None when there has been no odometry since the chain began.
+    """
+
+    stamp_ns: int
+    cloud: Cloud
+    place: Place
+    T_odom_sensor: Array | None
+
+
+@dataclass(frozen=True)
+class Link:
+    """A frame that is part of the chain.  T: (4, 4), its accumulated pose; Y: (6, 6), right."""
+
+    frame: Frame
+    T: Array
+    Y: Array
+
+
+def makes_keyframe(T_ref_read: Array, overlap_ratio: float, config: NodeConfig) -> bool:
+    """Return whether a registered scan is far enough from its keyframe to be the next one."""
+    way_m = np.linalg.norm(T_ref_read[:3, 3])
+    angle_rad = np.linalg.norm(se3.log(T_ref_read)[3:])
+    return bool(
+        way_m > config.keyframe_distance_m
+        or angle_rad > config.keyframe_angle_rad
+        or overlap_ratio < config.keyframe_min_overlap
+    )
+
+
+class Map:
+    """A cloud that stays; what lies around the sensor is prepared once and kept for a while."""
+
+    def __init__(self, stamp_ns: int, points: Array, frame_id: str) -> None:
+        """points: (N, 3), in the frame ``frame_id``."""
+        self.stamp_ns, self.points, self.frame_id = stamp_ns, points, frame_id
+        self._cloud: Cloud | None = None
+        self._centre = np.zeros(3)
+        self._made_with: tuple[float, CloudConfig, int] | None = None
+
+    def around(
+        self, position: Array, range_m: float, config: CloudConfig, seed: int
+    ) -> tuple[Cloud, Array]:
+        """Return the prepared points around a position and T_map_crop, the frame they are in.
+
+        That frame has the axes of the map and its origin at a place at most a quarter of
+        ``range_m`` from the position.  position: (3,).  Raises NoOverlapError.
+        """
+        made_with = (range_m, config, seed)
+        moved_m = np.linalg.norm(position - self._centre)
+        if self._cloud is None or moved_m > _MOVED * range_m or made_with != self._made_with:
+            self._cloud = None
+            self._cloud = self._prepared(position, range_m, config, seed)
+            self._centre, self._made_with = np.array(position), made_with
+        return self._cloud, se3.pose(self._centre, [0.0, 0.0, 0.0, 1.0])
+
+    def _prepared(self, centre: Array, range_m: float, config: CloudConfig, seed: int) -> Cloud:
+        rng = np.random.default_rng([seed, self.stamp_ns & (2**64 - 1)])
+        low, high = centre - range_m, centre + range_m
+        near = self.points[((self.points >= low) & (self.points <= high)).all(axis=1)]
+        try:
+            sphere = replace(config, min_range_m=0.0, max_range_m=range_m)
+            return prepare(near - centre, sphere, rng)
+        except CloudError as error:
+            raise NoOverlapError(
+                f"the reference cloud around the guess of the sensor is too small: {error}"
+            ) from None
