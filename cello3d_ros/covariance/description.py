@@ -10,6 +10,7 @@ from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import Pipeline
 from cello3d_ros.covariance.closed_form import closed_form
 from cello3d_ros.covariance.descriptor import describe_clouds
+from cello3d_ros.covariance.features import global_features
 from cello3d_ros.errors import NoOverlapError
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.registration.overlap import Overlap, find_overlap
@@ -20,13 +21,15 @@ class Description(NamedTuple):
 
     n_overlap: overlapping points of both clouds; overlap_ratio: share of the reading's points;
     descriptors: (n_rotations, n_features), the k-th after a turn of the reading frame by
-    2 pi k / n_rotations about z; shapes: cheap predictors by name, each (6, 6), reading side;
-    overlap: the associations that all of it comes from.
+    2 pi k / n_rotations about z; features: the numbers that ``FEATURES`` names; shapes: cheap
+    predictors by name, each (6, 6), reading side; overlap: the associations that all of it comes
+    from.
     """
 
     n_overlap: int
     overlap_ratio: float
     descriptors: Array
+    features: Array
     shapes: dict[str, Array]
     overlap: Overlap
 
@@ -51,7 +54,8 @@ def describe(
         reading, reference, T_ref_read, overlap.distances2, overlap.indices, pipeline.icp
     )._asdict()
     descriptors = _descriptors(reading, reference, T_ref_read, overlap, pipeline, n_rotations)
-    return Description(overlap.n_points, overlap.ratio, descriptors, shapes, overlap)
+    features = global_features(reading, reference, T_ref_read, overlap, shapes, pipeline.icp)
+    return Description(overlap.n_points, overlap.ratio, descriptors, features, shapes, overlap)
 
 
 def turns(n_rotations: int) -> Array:

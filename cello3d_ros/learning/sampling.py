@@ -204,6 +204,7 @@ def describe_pair(
         base,
         overlap_ratio=pair.overlap_ratio,
         descriptors=pair.descriptors.astype(np.float32),
+        features=pair.features,
         rotations_rad=2.0 * np.pi * np.arange(sampling.n_rotations) / sampling.n_rotations,
         shapes=pair.shapes,
     )

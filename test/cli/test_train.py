@@ -20,6 +20,7 @@ from cello3d_ros.cli import train as verb
 from cello3d_ros.cli.main import main
 from cello3d_ros.config import Pipeline, SamplingConfig
 from cello3d_ros.covariance.archive import write_arrays
+from cello3d_ros.covariance.features import FEATURES
 from cello3d_ros.covariance.model import load_model
 from cello3d_ros.errors import Cello3dError, DatasetError
 from cello3d_ros.geometry.se3 import Array
@@ -47,6 +48,7 @@ def fill(path: Path, names: list[str], seed: int = 0, **settings: object) -> Pat
                     kept=np.ones(40, np.bool_),
                     covariance=xi.T @ xi / 39,
                     descriptors=rng.random((2, 22), dtype=np.float32),
+                    features=rng.normal(size=len(FEATURES)),
                     rotations_rad=np.array([0.0, np.pi / 2]),
                     shapes={"sandwich": np.eye(6) * 1e-4, "hessian": np.eye(6) * 1e-6},
                 )
@@ -71,7 +73,9 @@ def test_a_model_with_its_provenance_and_a_table_come_out(
     out = tmp_path / "model.npz"
     cello3d_train(folder, "--out", out, "--validation", "*_s3")
     model = load_model(out)
-    assert model.n_examples == 3 * 5 * 2
+    assert model.n_examples == 3 * 5  # global features: without turned copies
+    assert (model.features, model.n_features) == ("global", len(FEATURES))
+    assert len(model.rho_quantiles) == 101
     assert model.shape == "sandwich"
     assert model.provenance["recordings"] == {"hall_s0": 5, "hall_s1": 5, "wood_s0": 5}
     assert model.provenance["validation_recordings"] == {"hall_s3": 5, "wood_s3": 5}
@@ -92,7 +96,7 @@ def test_validation_and_excluded_recordings_never_enter_training(
 ) -> None:
     outs = [tmp_path / "one.npz", tmp_path / "two.npz"]
     words = ("--validation", "hall_s3", "--exclude", "wood_*", "--config", tmp_path / "c.yaml")
-    (tmp_path / "c.yaml").write_text("training: {max_iterations: 3}")
+    (tmp_path / "c.yaml").write_text("training: {max_iterations: 3, features: descriptor}")
     cello3d_train(folder, "--out", outs[0], *words)
     model = load_model(outs[0])
     dataset = open_dataset(folder)
