@@ -150,7 +150,7 @@ def _draw(axes: Any, walk: _Walk, path: list[GaussianPose], factor: float) -> No
             label=f"{_N_SIGMA:g}σ" if last else None,
         )
     axes.plot(*truth.T, color="black", linewidth=3, zorder=2, label="truth")
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal")
     axes.grid(alpha=0.25)
 
 
