@@ -32,7 +32,7 @@ def make(
     found = datasets(workshop, {k: training[k] for k in SEQUENCES if k in needed})
     rows = {}
     for key in keys:
-        models, _ = trained(workshop, found, key)
+        models, _ = trained(workshop, found, key, ("paper", "relative"))
         rows[key] = {
             name: _sequence(workshop, walks[key], model, n_runs) for name, model in models.items()
         }

@@ -74,7 +74,7 @@ def make(workshop: Workshop, training: Recordings, walks: Recordings) -> Result:
 
 
 def _walk(workshop: Workshop, found: dict[str, Dataset], walks: Recordings, key: str) -> _Walk:
-    models, _ = trained(workshop, found, key)
+    models, _ = trained(workshop, found, key, ("paper", "relative"))
     recording = walks[key][0]
     chain = sampled(workshop, f"{key}_chain", [recording], max_gap=1)
     scans = range(len(recording))

@@ -75,7 +75,7 @@ def test_tables_on_the_papers_own_format(
     found = json.loads((out / "table1-recorded.json").read_text())
     assert list(found["sequences"]) == ["gazebo_summer", "gazebo_winter"]
     row = found["sequences"]["gazebo_summer"]["methods"]
-    assert set(row) == {"baseline", "paper", "relative", "censi"}
+    assert set(row) == {"baseline", "letter", "paper", "relative", "censi"}
     for figures in row.values():
         assert figures["n_pairs"] == N_SCANS * (N_SCANS - 1) // 2
         assert figures["kl_mean"] > 0.0
@@ -107,8 +107,8 @@ def test_odometry_on_the_papers_own_format(data: Path, out: Path) -> None:
     words = ("--data", data, "--samples", 30)
     assert reproduce("table2", out, *words, "--runs", 3) == 0
     found = json.loads((out / "table2-recorded.json").read_text())
-    for models in found["sequences"].values():
-        for report in models.values():
+    for by_model in found["sequences"].values():
+        for report in by_model.values():
             assert report["n_runs"] + report["n_failed"] == 3
             assert report["length_m"] == pytest.approx(0.95, abs=0.05)
             assert report["error_m"] < 0.5
