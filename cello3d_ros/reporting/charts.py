@@ -30,7 +30,7 @@ _COLORS = {
 }
 _SHOWN_FIRST = ("model", "mean_covariance", "censi", "fused")  # others by a click in the legend
 _REFERENCE, _READING = "#2166ac", "#b2182b"
-_SAMPLED, _PREDICTED, _DROPPED = "#1b7837", "#7b3294", "#d95f02"
+_SAMPLED, _PREDICTED, _DROPPED = "#1b7837", "#a040c8", "#d95f02"
 _N_SIGMA = 2.0
 
 
@@ -89,10 +89,15 @@ def divergence_chart(pairs: list[dict[str, Any]]) -> Chart:
 
 
 def trajectory_chart(paths: dict[str, Any]) -> Chart:
-    """Return the true path and the runs from above; ellipses of 2 sigma of the first run."""
+    """Return the true path and the runs from above; ellipses of 2 sigma of the first run.
+
+    Errors and ellipses are drawn larger about the truth by a factor that the axis states.
+    """
     truth = np.array(paths["truth"], np.float64)
     runs = np.array(paths["positions"], np.float64).reshape(-1, len(truth) - 1, 3)
     C = np.array(paths["covariances"], np.float64).reshape(*runs.shape, 3)
+    factor = _magnification(truth, C)
+    runs = truth[1:] + factor * (runs - truth[1:])
     data: list[Chart] = []
     for k, run in enumerate(runs):
         xy = np.vstack([truth[:1, :2], run[:, :2]])
@@ -104,7 +109,7 @@ def trajectory_chart(paths: dict[str, Any]) -> Chart:
             }
         )
     for k in range(len(truth) - 1 if len(runs) else 0):
-        x, y = _ellipse(runs[0, k, :2], C[0, k, :2, :2])
+        x, y = _ellipse(truth[k + 1, :2], factor**2 * C[0, k, :2, :2])
         last = k == len(truth) - 2
         data.append(
             {
@@ -117,7 +122,7 @@ def trajectory_chart(paths: dict[str, Any]) -> Chart:
     data.append(
         {
             **{"x": truth[:, 0].tolist(), "y": truth[:, 1].tolist(), "mode": "lines"},
-            **{"line": {"color": "#444444", "width": 3, "dash": "dot"}, "name": "truth"},
+            **{"line": {"color": "#8a8a8a", "width": 3, "dash": "dot"}, "name": "truth"},
         }
     )
     if len(runs):
@@ -130,35 +135,44 @@ def trajectory_chart(paths: dict[str, Any]) -> Chart:
         )
     layout = {
         "xaxis": {"title": {"text": "x in m"}},
-        "yaxis": {"title": {"text": "y in m"}, "scaleanchor": "x"},
+        "yaxis": {
+            "title": {"text": f"y in m, errors × {factor:g}" if factor > 1 else "y in m"},
+            "scaleanchor": "x",
+        },
     }
     return {"data": data, "layout": layout}
 
 
 def samples_chart(pair: dict[str, Any]) -> Chart:
     """Return where the registrations of a pair ended, and the ellipsoids of their covariances."""
-    xi = 1e3 * np.array(pair["xi"], np.float64).reshape(-1, 6)[:, :3]
+    u = 1e3 * np.array(pair["xi"], np.float64).reshape(-1, 6)[:, :3]
     kept = np.array(pair["kept"], np.bool_)
+    Y = [np.array(pair[key], np.float64).reshape(6, 6) for key in ("covariance", "predicted")]
+    reach = 2.5e3 * max(float(np.sqrt(np.diag(F)[:3].max())) for F in Y)
+    reach = max(reach, 1.05 * float(np.abs(u[kept]).max(initial=0.0)))
+    near = (np.abs(u) <= reach).all(axis=1)
     data: list[Chart] = []
     for mask, name, color in ((kept, "kept", _SAMPLED), (~kept, "dropped", _DROPPED)):
         if mask.any():
-            data.append(_cloud(xi[mask], f"{name} ({mask.sum()})", color, 2.5))
-    for key, name, color in (
-        ("covariance", "sampled, 2σ", _SAMPLED),
-        ("predicted", "predicted, 2σ", _PREDICTED),
-    ):
-        Y = np.array(pair[key], np.float64).reshape(6, 6)[:3, :3]
-        data.append(_ellipsoid(1e6 * Y, name, color))
-    data.append(_cloud(np.zeros((1, 3)), "truth", "#000000", 5.0))
-    return {"data": data, "layout": {"scene": _scene("mm", "cube" if len(xi) else "data")}}
+            far = (mask & ~near).sum()
+            told = f"{mask.sum()}, {far} too far to show" if far else f"{mask.sum()}"
+            data.append(_cloud(u[mask & near], f"{name} ({told})", color, 2.5))
+    for F, name, color in zip(Y, ("sampled, 2σ", "predicted, 2σ"), (_SAMPLED, _PREDICTED)):
+        data.append(_ellipsoid(1e6 * F[:3, :3], name, color))
+    data.append(_cloud(np.zeros((1, 3)), "truth", "#8a8a8a", 6.0))
+    data[-1]["marker"]["symbol"] = "cross"
+    scene = _scene("mm", "cube")
+    for axis in "xyz":
+        scene[f"{axis}axis"]["range"] = [-reach, reach]
+    return {"data": data, "layout": {"scene": scene}}
 
 
 def clouds_chart(reading: Array, reference: Array, T_mean: ArrayLike) -> Chart:
     """Return both clouds of a pair, the reading where it belongs, in the reference's frame."""
     T = np.array(T_mean, np.float64).reshape(4, 4)
     data = [
-        _cloud(reference, "reference", _REFERENCE, 1.5),
-        _cloud(transform(T, reading), "reading", _READING, 1.5),
+        _cloud(reference, "reference", _REFERENCE, 1.2),
+        _cloud(transform(T, reading), "reading", _READING, 1.2),
     ]
     return {"data": data, "layout": {"scene": _scene("m", "data")}}
 
@@ -216,6 +230,16 @@ def _ellipse(center: Array, C: Array) -> tuple[list[float], list[float]]:
     return np.round(x, 6).tolist(), np.round(y, 6).tolist()
 
 
+def _magnification(truth: Array, C: Array) -> float:
+    """Return 1, 2, 5, 10, ... by which errors are drawn larger so that they are seen."""
+    if not C.size:
+        return 1.0
+    spread = _N_SIGMA * float(np.median(np.sqrt(np.trace(C[:, -1], axis1=1, axis2=2))))
+    wanted = 0.1 * float(np.ptp(truth, axis=0).max()) / max(spread, 1e-9)
+    steps = [10.0**e * m for e in range(4) for m in (1, 2, 5)]
+    return max([1.0, *(step for step in steps if step <= wanted)])
+
+
 def _packed(values: Array) -> dict[str, str]:
     """Return numbers as plotly.js reads them: float32, in base64."""
     data = np.ascontiguousarray(values, "<f4").tobytes()
@@ -224,4 +248,5 @@ def _packed(values: Array) -> dict[str, str]:
 
 def _scene(unit: str, aspect: str) -> Chart:
     axes = {f"{axis}axis": {"title": {"text": f"{axis} in {unit}"}} for axis in "xyz"}
-    return {**axes, "aspectmode": aspect}
+    camera = {"eye": {"x": -1.5, "y": -1.9, "z": 1.4}}
+    return {**axes, "aspectmode": aspect, "camera": camera}
