@@ -4,8 +4,8 @@
 stamp) in the frame of the sensor at the reference, by default the cloud answered before;
 header.frame_id is the frame of the cloud.  ``~/pose`` is the chain of them since its last restart,
 in the frame of the odometry, where it starts without error at the odometry's pose; its errors
-accumulate and must not be fused as if they were independent.  Nothing is published for a cloud without an
-answer; ``/diagnostics`` says why.
+accumulate and must not be fused as if they were independent.  Nothing is published for a cloud
+without an answer; ``/diagnostics`` says why.
 
 This module is the node's life and its wiring: configure loads and warms up, activate listens.
 What is heard goes to the worker (worker.py), its answers to the outputs (outputs.py).
