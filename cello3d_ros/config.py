@@ -183,6 +183,9 @@ class NodeConfig(Section):
     external_tolerance_s: float = _setting(
         1e-3, "largest distance in time of an external pose and its cloud", 0.0, 1.0
     )
+    max_external_offset: float = _setting(
+        0.5, "an external pose that ICP would move farther (m, rad) is refused; 0 is no look", 0.0
+    )
     guess_without_odometry: str = _setting(
         "skip",
         "what to do with a cloud for which no odometry came in time",

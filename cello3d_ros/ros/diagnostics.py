@@ -119,6 +119,17 @@ def _described(answer: Answer, C: Array) -> dict[str, str]:
         "weakest_sigma_m": f"{np.sqrt(values[-1]):.6g}",
         "weakest_direction": " ".join(f"{value:.3f}" for value in vectors[:, -1]),
         "weakest_eigenvalue": f"{np.linalg.eigvalsh(C)[-1]:.6g}",
+        **_offset(answer.offset),
+    }
+
+
+def _offset(offset: Array | None) -> dict[str, str]:
+    """Return how far ICP would move an external pose."""
+    if offset is None:
+        return {}
+    return {
+        "external_offset_m": f"{np.linalg.norm(offset[:3]):.4f}",
+        "external_offset_rad": f"{np.linalg.norm(offset[3:]):.5f}",
     }
 
 

@@ -12,11 +12,12 @@ import numpy as np
 
 from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import NodeConfig, Pipeline
-from cello3d_ros.covariance.estimator import Estimate, estimate, registered_elsewhere
+from cello3d_ros.covariance.estimator import Estimate, estimate
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import CloudError, ModelError, NoOverlapError, RegistrationError
 from cello3d_ros.geometry.gaussian import GaussianPose, compound_right, is_positive_definite
 from cello3d_ros.geometry.se3 import Array, inverse
+from cello3d_ros.ros.external import DisagreementError, External, checked
 from cello3d_ros.ros.frames import seen_from_base
 from cello3d_ros.ros.guess import CONSTANT_VELOCITY, EXTERNAL, ODOMETRY, Motion, Place
 from cello3d_ros.ros.pairing import Frame, Link, Map, makes_keyframe
@@ -46,7 +47,8 @@ class Answer:
 
     T_odom_read: (4, 4), the accumulated pose; its covariance Y_chain: (6, 6), reading side.
     frame_id, pose_frame_id: the frames of the registration and of the accumulated pose;
-    child_frame_id: whose pose they are.  guess: where the first guess came from.
+    child_frame_id: whose pose they are.  guess: where the first guess came from.  offset: (6,),
+    the twist by which ICP would move an external pose, else None.
     """
 
     stamp_ns: int
@@ -58,6 +60,7 @@ class Answer:
     pose_frame_id: str = "odom"
     child_frame_id: str = "lidar"
     guess: str = ODOMETRY
+    offset: Array | None = None
 
 
 class Tracker:
@@ -167,22 +170,37 @@ class Tracker:
 
     def _answer(self, reading: Frame, reference: Link, rng: np.random.Generator) -> Answer:
         T_init, guess = self._guess(reading, reference)
+        clouds = reading.cloud, reference.frame.cloud
+        external: External | None = None
+        if guess == EXTERNAL:
+            limit = self.config.max_external_offset
+            external = checked(*clouds, T_init, self.pipeline.icp, limit, rng)
         found = estimate(
-            reading.cloud,
-            reference.frame.cloud,
+            *clouds,
             T_init,
             self.model,
             self.pipeline,
             rng,
-            registration=registered_elsewhere(T_init) if guess == EXTERNAL else None,
+            registration=None if external is None else external.registration,
         )
+        if external is not None:
+            offset = external.offset
+            found = found._replace(covariance=found.covariance + np.outer(offset, offset))
         if not found.registration.converged:
             raise NotConvergedError(
                 f"ICP did not converge in {found.registration.n_iterations} iterations "
                 f"({found.registration.reason})"
             )
         T, Y = _extended(reference.T, reference.Y, found.registration.T_ref_read, found.covariance)
-        return Answer(reading.stamp_ns, reference.frame.stamp_ns, found, T, Y, guess=guess)
+        return Answer(
+            reading.stamp_ns,
+            reference.frame.stamp_ns,
+            found,
+            T,
+            Y,
+            guess=guess,
+            offset=None if external is None else external.offset,
+        )
 
     def _guess(self, reading: Frame, reference: Link) -> tuple[Array, str]:
         """Return the first guess of T_ref_read and where it comes from."""
@@ -263,6 +281,7 @@ def reason_of(error: Exception) -> str:
         TooFarApartError: "too_far_apart",
         BrokenChainError: "broken_chain",
         NoReferenceError: "no_reference",
+        DisagreementError: "external_disagrees",
         NoOverlapError: "no_overlap",
         RegistrationError: "registration",
         ModelError: "beyond_model",

@@ -118,15 +118,19 @@ def test_external_takes_one_parameter_and_one_remapping(start, constant_Y) -> No
     player = start("-r", "external_odometry:=/odom", registration="external")
     scans = walk()
     played = replay.play(player, scans)
+    offsets = []
     assert list(played.relative) == [scan.stamp_ns for scan in scans[1:]]
     for before, scan in itertools.pairwise(scans):
         pose, status = played.relative[scan.stamp_ns], played.status[scan.stamp_ns]
         expected = se3.inverse(before.T_odom_sensor) @ scan.T_odom_sensor
         np.testing.assert_allclose(pose.T, expected, atol=1e-9)  # to the last digit: no ICP
-        Y = messages.reading_covariance(pose.C, pose.T[:3, :3])
-        np.testing.assert_allclose(Y, constant_Y, atol=1e-12)
         np.testing.assert_allclose(played.poses[scan.stamp_ns].T, scan.T_odom_sensor, atol=1e-9)
         assert (status["guess"], status["iterations"]) == ("external", "0")
+        extra = messages.reading_covariance(pose.C, pose.T[:3, :3]) - constant_Y
+        offsets.append(float(status["external_offset_m"]))
+        np.testing.assert_allclose(np.sqrt(np.trace(extra[:3, :3])), offsets[-1], atol=1e-4)
+        assert np.linalg.eigvalsh(extra)[4] < 1e-9  # of rank one
+    assert max(offsets) < 0.02  # the poses are the truth
 
 
 def test_an_external_pose_belongs_to_the_cloud_of_its_stamp(start) -> None:
