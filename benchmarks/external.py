@@ -3,11 +3,11 @@
     pip install kiss-icp
     python benchmarks/external.py --recording DIR --json FILE
 
-KISS-ICP registers each scan to its own local map, from its own first guess, without odometry.  Its
-poses go through the part of the node that ``node.registration: external`` uses; beside it stand
-``unseen``, the same with ``max_external_offset: 0``, and ``icp``, our own registrations of the same
-pairs from drifting odometry.  Errors are those of consecutive relative poses against the poses of
-the recording, which may be no better themselves.
+KISS-ICP registers each scan to its own local map, from its own first guess, without odometry.
+Its poses go through the part of the node that ``node.registration: external`` uses; beside it
+stand ``unseen``, the same with ``max_external_offset: 0``, and ``icp``, our own registrations of
+the same pairs from drifting odometry.  Errors are those of consecutive relative poses against the
+poses of the recording, which may be no better themselves.
 """
 
 from __future__ import annotations

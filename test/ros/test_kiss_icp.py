@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
-kiss_icp = pytest.importorskip("kiss_icp.kiss_icp")
+pytest.importorskip("kiss_icp")
 
 from kiss_icp.config import load_config
+from kiss_icp.kiss_icp import KissICP
 
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import mahalanobis
@@ -36,7 +37,7 @@ def scans() -> InMemory:
     """Ten scans of a street, with KISS-ICP's poses where odometry would be."""
     config = load_config(None)
     config.data.deskew = False
-    odometry, scans = kiss_icp.KissICP(config), InMemory()
+    odometry, scans = KissICP(config), InMemory()
     for k, scan in enumerate(islice(open_recording(STREET), 10)):
         odometry.register_frame(scan.points, np.zeros(len(scan.points)))
         stamp_ns = 10**18 + k * STEP_NS
