@@ -175,6 +175,9 @@ class NodeConfig(Section):
     reference_range_m: float = _setting(
         60.0, "points of reference_points used around the sensor", 1.0, 1e4
     )
+    max_reference_points: int = _setting(
+        50_000, "more points of them are thinned out", 1000, 10_000_000
+    )
     registration: str = _setting(
         "icp",
         "who registers: this node, or another program (external_odometry or external_pose)",

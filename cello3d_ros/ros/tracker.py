@@ -158,12 +158,7 @@ class Tracker:
             T_map_sensor = self._motion.at(frame.stamp_ns)
         else:
             T_map_sensor = T_map_odom @ frame.T_odom_sensor
-        cloud, T_map_crop = self._map.around(
-            T_map_sensor[:3, 3],
-            self.config.reference_range_m,
-            self.pipeline.cloud,
-            self.config.seed,
-        )
+        cloud, T_map_crop = self._map.around(T_map_sensor[:3, 3], self.config, self.pipeline.cloud)
         T_odom_crop = inverse(T_map_odom) @ T_map_crop
         crop = Frame(self._map.stamp_ns, cloud, frame.place, T_odom_crop)
         return Link(crop, T_map_crop, np.zeros((6, 6)))
