@@ -139,7 +139,13 @@ class TrainingConfig(Section):
     loss: str = _setting("log_det", "paper is the printed det F", choices=("log_det", "paper"))
     regularization: float = _setting(0.03, "lambda of lambda |Theta|^2", 0.0)
     mean_weight: float = _setting(0.15, "share of the training mean in a prediction", 0.0, 1.0)
-    max_iterations: int = _setting(100, "optimiser steps", 1)
+    optimizer: str = _setting(
+        "lbfgs", "what searches Theta; sgd is the paper's", choices=("lbfgs", "sgd")
+    )
+    learning_rate: float = _setting(
+        1e-5, "of sgd: Theta goes down this times each pair's gradient", 1e-12
+    )
+    max_iterations: int = _setting(100, "optimiser steps; of sgd, passes over all pairs", 1)
     seed: int = _setting(0, "seed of the initial Theta", 0)
 
 
@@ -204,9 +210,33 @@ class NodeConfig(Section):
     max_pair_gap_s: float = _setting(10.0, "scans farther apart are not paired", 0.0)
     max_failures: int = _setting(3, "failed pairs before the reference is given up", 1)
     future_tolerance_s: float = _setting(0.5, "a cloud stamped later than now + this", 0.0)
+    covariance_mode: str = _setting(
+        "cello3d",
+        "what says how far a registration is to be trusted",
+        choices=("cello3d", "fused", "sigma_points", "censi", "hessian", "constant"),
+    )
+    sensor_sigma_m: float = _setting(
+        0.01, "range noise that censi, hessian and sigma_points assume", 1e-6, 10.0
+    )
+    n_registrations: int = _setting(12, "extra runs of ICP of the mode fused", 1, 200)
+    scale: float = _setting(1.0, "every covariance is multiplied by this", 1e-6, 1e6)
+    unknown_quantile: float = _setting(
+        0.99,
+        "share of the model's examples nearer to another recording than a known pair",
+        0.0,
+        1.0,
+    )
+    inflate_unknown: bool = _setting(
+        True, "widen the covariance of an unknown pair to the mean of the model's examples"
+    )
+    warn_sigma_m: float = _setting(0.3, "3 sigma along the weakest axis that warns", 0.0)
+    error_sigma_m: float = _setting(1.0, "3 sigma along the weakest axis that is an error", 0.0)
     floor_sigma_m: float = _setting(1e-4, "smallest published standard deviation", 1e-9)
     floor_sigma_rad: float = _setting(1e-5, "smallest published standard deviation", 1e-9)
     ceiling: float = _setting(900.0, "largest published eigenvalue (m^2, rad^2)", 1e-6, 1e3)
+    marker_scale: float = _setting(1.0, "~/markers are drawn this many times as large", 1e-3, 1e6)
+    marker_lifetime_s: float = _setting(10.0, "~/markers vanish after this; 0 is never", 0.0)
+    publish_tf: bool = _setting(False, "publish ~/pose on /tf as well; needs tf2_msgs")
     seed: int = _setting(0, "seed of the random subsamples", 0)
 
     def __post_init__(self) -> None:
@@ -217,6 +247,12 @@ class NodeConfig(Section):
                 "NodeConfig.T_base_sensor needs x y z and a unit quaternion qx qy qz qw: "
                 f"{self.T_base_sensor}"
             )
+        for name in ("floor_sigma_m", "floor_sigma_rad"):
+            if (floor := getattr(self, name)) ** 2 >= self.ceiling:
+                raise ConfigError(
+                    f"NodeConfig.{name} must be below the root of NodeConfig.ceiling, "
+                    f"{math.sqrt(self.ceiling):g}: {floor}"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,6 +285,7 @@ SECTIONS: dict[str, type[Any]] = {
 }
 
 PIPELINE = ("cloud", "icp", "overlap", "grid")
+_SCATTER = ("variance", "noise_m")  # of sampling: what the registrations of a model scattered by
 
 S = TypeVar("S", bound=Section)
 
@@ -298,12 +335,22 @@ def pipeline_of(config: Pipeline) -> Pipeline:
 
 
 def differences(ours: Pipeline, theirs: Pipeline) -> list[str]:
-    """Name each pipeline setting that differs: ``icp.trim_ratio is 0.8, not 0.7``."""
-    return [
-        f"{name}.{key} is {value}, not {getattr(getattr(theirs, name), key)}"
+    """Name each setting that differs and matters: ``icp.trim_ratio is 0.8, not 0.7``.
+
+    Those of the pipeline, and of two whole Configs the variances of sampling.
+    """
+    settings = [
+        (name, field.name)
         for name in PIPELINE
-        for key, value in dataclasses.asdict(getattr(ours, name)).items()
-        if value != getattr(getattr(theirs, name), key)
+        for field in dataclasses.fields(getattr(ours, name))
+    ]
+    if isinstance(ours, Config) and isinstance(theirs, Config):
+        settings += [("sampling", key) for key in _SCATTER]
+    return [
+        f"{name}.{key} is {value}, not {other}"
+        for name, key in settings
+        if (value := getattr(getattr(ours, name), key))
+        != (other := getattr(getattr(theirs, name), key))
     ]
 
 

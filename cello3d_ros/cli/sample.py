@@ -63,7 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Sample what is missing; the same command finishes what was interrupted."""
+    from threadpoolctl import threadpool_limits
+
     from cello3d_ros.learning.dataset import open_dataset
+    from cello3d_ros.learning.identity import fingerprint
     from cello3d_ros.recordings import open_recording
 
     config = load_config(arguments.config) if arguments.config else Config()
@@ -77,9 +80,11 @@ def run(arguments: argparse.Namespace) -> None:
     with _progress() as bar, _sampler(arguments, pipeline, sampling, paths, bar) as sampler:
         dataset = open_dataset(arguments.out, pipeline, sampling, create=True)
         for recording in recordings:
-            dataset.add_recording(recording.name, {"n_scans": len(recording)})
+            facts = {"n_scans": len(recording), "fingerprint": fingerprint(recording)}
+            dataset.add_recording(recording.name, facts)
         try:
-            outcomes = _sample(recordings, dataset, sampler, bar, arguments.jobs)
+            with threadpool_limits(1, user_api="blas"):  # its threads take the kernels' cores
+                outcomes = _sample(recordings, dataset, sampler, bar, arguments.jobs)
         except SystemError as error:  # what CPython makes of Ctrl-C in a compiled kernel
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise error.__cause__ from None

@@ -15,9 +15,9 @@ from cello3d_ros.config import TrainingConfig, load_config
 from cello3d_ros.errors import Cello3dError, DatasetError
 
 if TYPE_CHECKING:
-    from cello3d_ros.learning.dataset import Dataset
     from cello3d_ros.learning.evaluation import Figures
 
+_FLAGS = ("shape", "theta", "loss", "optimizer")
 _COLUMNS = (  # heading, figure
     ("KL mean", "kl_mean"),
     ("median", "kl_median"),
@@ -37,7 +37,13 @@ class Split(NamedTuple):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
     parser.add_argument("datasets", nargs="+", type=Path, metavar="DATASET", help="folder")
-    parser.add_argument("--out", required=True, type=Path, metavar="MODEL", help="file to write")
+    parser.add_argument(
+        "--out",
+        required=True,
+        type=Path,
+        metavar="MODEL",
+        help="file to write, and beside it MODEL.learning_curve.png",
+    )
     parser.add_argument(
         "--validation",
         nargs="+",
@@ -56,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="recordings, the same way, that are not looked at: those kept for tests",
     )
     parser.add_argument("--config", metavar="FILE", help="YAML settings, section training")
-    for name in ("shape", "theta", "loss"):
+    for name in _FLAGS:
         choices = TrainingConfig.__dataclass_fields__[name].metadata["choices"]
         parser.add_argument(f"--{name}", choices=choices, help="in place of the setting")
 
@@ -66,6 +72,8 @@ def run(arguments: argparse.Namespace) -> None:
     from cello3d_ros.covariance.model import save_model
     from cello3d_ros.learning.dataset import open_dataset
     from cello3d_ros.learning.examples import load_examples
+    from cello3d_ros.learning.identity import check_apart, recordings_of
+    from cello3d_ros.learning.learning_curve import plot_learning_curve
     from cello3d_ros.learning.training import train
 
     config = _settings(arguments)
@@ -73,18 +81,23 @@ def run(arguments: argparse.Namespace) -> None:
     folders = [word for word in arguments.validation if _is_dataset(word)]
     paths = {path.resolve(): path for path in [*arguments.datasets, *map(Path, folders)]}
     datasets = [open_dataset(path) for path in paths.values()]
-    split = split_recordings(
-        _recordings(datasets), _names(arguments.validation), _names(arguments.exclude)
-    )
+    known = recordings_of(datasets)
+    split = split_recordings(known, _names(arguments.validation), _names(arguments.exclude))
+    excluded = sorted(set(known) - set(split.training) - set(split.validation))
+    check_apart(known, split.training, split.validation, excluded)
     examples = load_examples(datasets, split.training)
     validation = load_examples(datasets, split.validation) if split.validation else None
     training = train(examples, config, validation, _report if sys.stderr.isatty() else None)
     save_model(training.model, arguments.out)
+    judged_by = "validation recordings" if validation else "training, regularised"
+    picture = arguments.out.with_suffix(".learning_curve.png")
+    plot_learning_curve(training.curve, training.best_iteration, judged_by, picture)
     if training.interrupted:
         print("\ninterrupted: the model is the best so far", file=sys.stderr)
     pairs, recordings = len(examples.covariances), len(examples.n_pairs)
     steps = f"Theta of step {training.best_iteration} of {training.n_iterations}"
     print(f"{arguments.out}: {pairs} pairs of {recordings} recordings, {steps}")
+    print(f"{picture}: the loss over its steps")
     for name, figures in training.figures.items():
         print("\n".join(_table(name, figures)))
 
@@ -123,19 +136,15 @@ def _names(words: Sequence[str]) -> list[str]:
     patterns: list[str] = []
     for word in words:
         if _is_dataset(word):
-            patterns += map(glob.escape, _recordings([open_dataset(word)]))
+            patterns += map(glob.escape, open_dataset(word).recordings)
         else:
             patterns.append(word)
     return patterns
 
 
-def _recordings(datasets: Sequence[Dataset]) -> list[str]:
-    return sorted({key[0] for dataset in datasets for key in dataset.pair_keys()})
-
-
 def _settings(arguments: argparse.Namespace) -> TrainingConfig:
     config = load_config(arguments.config).training if arguments.config else TrainingConfig()
-    flags = {name: getattr(arguments, name) for name in ("shape", "theta", "loss")}
+    flags = {name: getattr(arguments, name) for name in _FLAGS}
     return replace(config, **{name: value for name, value in flags.items() if value})
 
 

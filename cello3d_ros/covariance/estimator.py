@@ -12,6 +12,7 @@ from cello3d_ros.covariance.description import describe
 from cello3d_ros.covariance.methods import DEFAULTS, METHODS, MethodSettings, Pair, predicted
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import ModelError, RegistrationError
+from cello3d_ros.geometry.gaussian import larger
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.backends import register
 from cello3d_ros.registration.icp import Registration
@@ -22,7 +23,7 @@ class Estimate(NamedTuple):
 
     covariance: (6, 6), reading side, ordered (u, omega), by ``method``; nearest_rho: squared
     distance of the model's nearest training example; effective_neighbors: how many examples
-    share in the model's answer.
+    share in the model's answer; is_unknown: whether the nearest is beyond the settings' limit.
     """
 
     registration: Registration
@@ -31,6 +32,7 @@ class Estimate(NamedTuple):
     nearest_rho: float
     effective_neighbors: float
     method: str = "model"
+    is_unknown: bool = False
 
 
 def estimate(
@@ -65,13 +67,17 @@ def estimate(
     Y = prediction.covariance
     if method != "model":
         Y = METHODS[method](pair, pipeline, model, rng, settings)
+    is_unknown = prediction.nearest_rho > settings.rho_limit
+    if is_unknown and settings.widen_unknown:
+        Y = larger(METHODS["constant"](pair, pipeline, model, rng, settings), Y)
     return Estimate(
         registration,
         description.overlap_ratio,
-        Y,
+        settings.scale * Y,
         prediction.nearest_rho,
         prediction.effective_neighbors,
         method,
+        is_unknown,
     )
 
 

@@ -7,6 +7,7 @@ definite covariance of its registration, reading side, ordered (u, omega).  The 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -35,14 +36,19 @@ class Pair(NamedTuple):
 
 
 class MethodSettings(NamedTuple):
-    """What the baselines assume.
+    """What methods assume and what is made of their answers.
 
     sigma_m: deviation of the sensor's noise along each axis; n_registrations: extra runs of ICP
-    by ``monte_carlo`` and ``fused``.
+    by ``monte_carlo`` and ``fused``.  What ``estimate`` makes of any answer: rho_limit, the
+    ``nearest_rho`` beyond which the pair is unlike all examples; widen_unknown, whether it is
+    then widened to their mean; scale, a factor for every covariance.
     """
 
     sigma_m: float = 0.01
     n_registrations: int = 12
+    rho_limit: float = math.inf
+    widen_unknown: bool = False
+    scale: float = 1.0
 
 
 Method = Callable[[Pair, Pipeline, Model, np.random.Generator, MethodSettings], Array]

@@ -150,6 +150,20 @@ def symmetrized(Y: ArrayLike) -> Array:
     return 0.5 * (Y + _transposed(Y))
 
 
+def larger(A: ArrayLike, B: ArrayLike) -> Array:
+    """Return the covariance that is as wide as the wider of A and B along every common axis.
+
+    ``L V diag(max(1, l)) V^T L^T`` with ``A = L L^T`` and ``L^-1 B L^-T = V diag(l) V^T``: neither
+    A nor B is larger than it in any direction, it is A or B where one is, and units do not matter.
+    A: (d, d), positive definite; B: (d, d), positive semidefinite.
+    """
+    L = np.linalg.cholesky(np.asarray(A, dtype=np.float64))
+    half = _solve_lower(L, np.asarray(B, dtype=np.float64))
+    values, V = np.linalg.eigh(symmetrized(_solve_lower(L, half.T)))
+    root = L @ V
+    return symmetrized((root * np.maximum(values, 1.0)) @ root.T)
+
+
 def matrix_sqrt(S: ArrayLike) -> Array:
     """Return the symmetric R with ``R R = S``.  (..., d, d); LinAlgError if not positive."""
     return _power(S, 0.5)

@@ -9,9 +9,10 @@ from __future__ import annotations
 import threading
 import uuid
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from cello3d_ros.clouds.neighbors import KdTree
 from cello3d_ros.clouds.shape import Cloud
@@ -59,6 +60,7 @@ class Job:
 
 def prepared(job: Job, index: int, scan: Scan | None) -> Prepared:
     """Task: prepare a scan, read here unless it was sent."""
+    _one_blas_thread()
     _check_versions(job.versions)
     scan = _read(job, index) if scan is None else scan
     return prepare_scan(scan, job.name, index, job.pipeline, job.sampling)
@@ -66,6 +68,7 @@ def prepared(job: Job, index: int, scan: Scan | None) -> Prepared:
 
 def described(job: Job, i: int, j: int, reference: Prepared, reading: Prepared) -> PairRecord:
     """Task: all of a record but the samples."""
+    _one_blas_thread()
     return describe_prepared(
         job.name, i, j, _owned(reference), _owned(reading), job.pipeline, job.sampling
     )
@@ -75,6 +78,7 @@ def registered(
     job: Job, record: PairRecord, reference: Prepared, reading: Prepared, start: int, stop: int
 ) -> Block | None:
     """Task: some registrations of a pair, none of a pair that is rejected already."""
+    _one_blas_thread()
     _check_versions(job.versions)
     Q, P = _owned(reference)[0], _owned(reading)[0]
     if record.reason != PENDING or isinstance(P, CloudError) or isinstance(Q, CloudError):
@@ -85,12 +89,14 @@ def registered(
 
 def finished_pair(job: Job, record: PairRecord, blocks: list[Block | None]) -> PairRecord:
     """Task: the record with its samples."""
+    _one_blas_thread()
     done = [block for block in blocks if block is not None]
     return finish_pair(record, done, job.sampling) if done else record
 
 
 def whole_pair(job: Job, i: int, j: int, reference: Prepared, reading: Prepared) -> PairRecord:
     """Task: all of a pair whose number of registrations is not known beforehand."""
+    _one_blas_thread()
     _check_versions(job.versions)
     return sample_prepared(
         job.name, i, j, _owned(reference), _owned(reading), job.pipeline, job.sampling
@@ -152,6 +158,12 @@ def _read(job: Job, index: int) -> Scan:
         _readers.clear()
         _readers[key] = reader
     return scan
+
+
+@cache
+def _one_blas_thread() -> None:
+    """Keep BLAS of this process to one thread: its waiting ones take the kernels' cores."""
+    threadpool_limits(1, user_api="blas")
 
 
 @lru_cache(maxsize=4)

@@ -111,15 +111,19 @@ class Dataset:
         return dict(self._manifest["versions"])
 
     def add_recording(self, name: str, facts: dict[str, Any]) -> None:
-        """Enter a recording in the manifest.  Raises DatasetError if its facts have changed."""
+        """Enter a recording in the manifest.  Raises DatasetError if its facts have changed.
+
+        Facts that an older manifest does not know are added.
+        """
         _check_name(name)
-        known = self._manifest["recordings"].get(name)
-        if known is None:
-            recordings = {**self._manifest["recordings"], name: facts}
+        known = self._manifest["recordings"].get(name, {})
+        facts = json.loads(json.dumps(facts))
+        if change := _first_difference(known, {n: facts.get(n) for n in known}):
+            raise DatasetError(f"{self.path} holds another recording named {name!r}: {change}")
+        if known != {**known, **facts} or name not in self._manifest["recordings"]:
+            recordings = {**self._manifest["recordings"], name: {**known, **facts}}
             self._manifest["recordings"] = dict(sorted(recordings.items()))
             _write_manifest(self.path, self._manifest)
-        elif change := _first_difference(known, json.loads(json.dumps(facts))):
-            raise DatasetError(f"{self.path} holds another recording named {name!r}: {change}")
 
     def pair_keys(self) -> list[tuple[str, int, int]]:
         """Return the pairs on disk, damaged ones too, ordered by recording, i, j."""

@@ -95,6 +95,12 @@ def select_features(problem: Problem, active: Indices) -> Problem:
     )
 
 
+def select_targets(problem: Problem, rows: Indices) -> Problem:
+    """Return the problem of predicting some of the targets, from all examples."""
+    chosen = {name: getattr(problem, name)[rows] for name in ("X", "Y", "groups", "means")}
+    return dataclasses.replace(problem, **chosen)
+
+
 def expand_features(theta: Array, active: Indices, n_features: int) -> Array:
     """Return Theta (r, D) over all features; a triangular one goes without its empty rows."""
     if theta.ndim == 1:

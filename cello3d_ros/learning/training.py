@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 
 from cello3d_ros.config import TrainingConfig
 from cello3d_ros.covariance.model import Model, project
-from cello3d_ros.errors import DatasetError
+from cello3d_ros.errors import ConfigError, DatasetError
 from cello3d_ros.geometry.packed import unpack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import package_versions
@@ -30,12 +30,15 @@ from cello3d_ros.learning.loss import (
     pair_losses,
     predicted,
     select_features,
+    select_targets,
     validation_problem,
 )
 
 Progress = Callable[[int, float, float], None]  # iteration, training loss, what Theta is judged by
 
 _PATIENCE = 20  # iterations without a better validation loss that end training
+_DIVERGED = 1e100  # |Theta|^2, far beyond anything and far below where numbers end
+_BATCH = 16  # targets of one stochastic gradient
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,6 +47,7 @@ class Training:
 
     figures: for "leave_recording_out" and, if there was one, "validation": predictor -> measure.
     n_iterations: steps made; best_iteration: the one whose Theta was kept (0 is before any).
+    curve: what ``progress`` was told, step by step.
     """
 
     model: Model
@@ -51,6 +55,7 @@ class Training:
     n_iterations: int
     best_iteration: int
     interrupted: bool
+    curve: tuple[tuple[int, float, float], ...]
 
 
 def train(
@@ -59,7 +64,7 @@ def train(
     validation: Examples | None = None,
     progress: Progress | None = None,
 ) -> Training:
-    """Fit Theta by L-BFGS and return the model with the best one met.
+    """Fit Theta by L-BFGS or SGD and return the model with the best one met.
 
     Best is by the loss on the validation recordings, predicted from the examples, or without them
     by the regularised leave-recording-out loss; training ends when that has not improved for 20
@@ -110,11 +115,12 @@ def train(
         n_iterations=search.n_iterations,
         best_iteration=search.best_iteration,
         interrupted=search.interrupted,
+        curve=tuple(search.curve),
     )
 
 
 class _Search:
-    """L-BFGS over Theta, remembering the best by the judge's loss."""
+    """Descent over Theta, remembering the best by the judge's loss."""
 
     def __init__(
         self, problem: Problem, judge: Problem, config: TrainingConfig, progress: Progress | None
@@ -124,6 +130,8 @@ class _Search:
         self.n_iterations = 0
         self.best_iteration = 0
         self.interrupted = False
+        self.curve: list[tuple[int, float, float]] = []
+        self._evaluated: tuple[Array, float] | None = None  # the last Theta, its loss
         self._initial = self._start()
         self.theta = self._matrix(np.zeros_like(self._initial))
         self._best = self._judged(self.theta)
@@ -132,18 +140,44 @@ class _Search:
         """Search until converged, no longer improving, out of iterations or interrupted."""
         try:
             self._remember(self._initial)
-            minimize(
-                self._objective,
-                self._initial,
-                jac=True,
-                method="L-BFGS-B",
-                callback=self._step,
-                options={"maxiter": self._config.max_iterations, "maxcor": 20},
-            )
+            if self._config.optimizer == "sgd":
+                self._descend()
+            else:
+                self._quasi_newton()
         except _Stop:
             pass
         except KeyboardInterrupt:
             self.interrupted = True
+
+    def _quasi_newton(self) -> None:
+        minimize(
+            lambda free: self._objective(free, self._problem),
+            self._initial,
+            jac=True,
+            method="L-BFGS-B",
+            callback=self._step,
+            options={"maxiter": self._config.max_iterations, "maxcor": 20},
+        )
+
+    def _descend(self) -> None:
+        """Follow the gradients of a few targets at a time, all of them once in an iteration.
+
+        ``Theta -= rate sum_k dL_k/dTheta`` over the targets k of a batch: to first order in the
+        rate the same as target by target, and independent of the size of the batch.
+        """
+        free, n = self._initial.copy(), len(self._problem.X)
+        rng = np.random.default_rng([self._config.seed, 1])
+        for _ in range(self._config.max_iterations):
+            order = rng.permutation(n)
+            for start in range(0, n, _BATCH):
+                batch = select_targets(self._problem, order[start : start + _BATCH])
+                free -= self._config.learning_rate * len(batch.X) * self._objective(free, batch)[1]
+                if not float(free @ free) < _DIVERGED:
+                    raise ConfigError(
+                        "training by sgd diverged: training.learning_rate must be less than "
+                        f"{self._config.learning_rate:g}"
+                    )
+            self._step(free)
 
     def _start(self) -> Array:
         """Return the free numbers of a Theta under which the median rho is 1."""
@@ -168,9 +202,11 @@ class _Search:
         theta[np.triu_indices(n)] = free
         return theta
 
-    def _objective(self, free: Array) -> tuple[float, Array]:
+    def _objective(self, free: Array, problem: Problem) -> tuple[float, Array]:
         theta = self._matrix(free)
-        value, gradient = loss_and_gradient(theta, self._problem, self._config.loss)
+        value, gradient = loss_and_gradient(theta, problem, self._config.loss)
+        if problem is self._problem:
+            self._evaluated = theta.copy(), value
         if self._config.theta == "upper_triangular":
             gradient = gradient[np.triu_indices(self._n_features)]
         penalty = self._config.regularization
@@ -180,8 +216,14 @@ class _Search:
         """Return the loss on validation, or without it what the search minimises."""
         if self._judge is self._problem:
             penalty = self._config.regularization * float(np.sum(theta**2))
-            return self._loss(theta, self._problem) + penalty
+            return self._training_loss(theta) + penalty
         return self._loss(theta, self._judge)
+
+    def _training_loss(self, theta: Array) -> float:
+        """Return the loss, for which the optimiser has mostly asked just before."""
+        if self._evaluated is None or not np.array_equal(self._evaluated[0], theta):
+            self._evaluated = theta.copy(), self._loss(theta, self._problem)
+        return self._evaluated[1]
 
     def _loss(self, theta: Array, problem: Problem) -> float:
         return float(
@@ -199,8 +241,9 @@ class _Search:
         judged = self._judged(theta)
         if judged < self._best:
             self._best, self.theta, self.best_iteration = judged, theta, self.n_iterations
+        self.curve.append((self.n_iterations, self._training_loss(theta), judged))
         if self._progress is not None:
-            self._progress(self.n_iterations, self._loss(theta, self._problem), judged)
+            self._progress(*self.curve[-1])
 
 
 class _Stop(Exception):

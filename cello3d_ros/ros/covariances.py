@@ -8,7 +8,10 @@ from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry.gaussian import symmetrized, to_fixed_axes
 from cello3d_ros.geometry.se3 import Array
 
+N_SIGMA = 3.0  # of what is shown and judged
+
 _CONDITION = 1e-13  # least ratio of eigenvalues that still is positive definite when rounded
+_HUGE = 1e12  # times the ceiling: beyond it a covariance is scaled down, so that nothing overflows
 
 
 class CovarianceError(Cello3dError):
@@ -22,19 +25,71 @@ def ros_covariance(
 
     ``C = B Y B^T`` with ``B = blkdiag(R, R)``, to first order: of the additive error of the
     position and of the rotation about fixed axes, both along the axes of header.frame_id.
-    Y: (6, 6), ordered (u, omega).  R_header_read: (3, 3).  Returns (6, 6) in m^2 and rad^2,
-    exactly symmetric, positive definite, ``C - diag(floor_sigma_m^2, floor_sigma_rad^2)``
-    positive semidefinite and no eigenvalue above ``ceiling``.  Raises CovarianceError for a Y
-    that is not finite.
+    Y: (6, 6), ordered (u, omega).  R_header_read: (3, 3).  Returns (6, 6) in m^2 and rad^2 within
+    the bounds of ``bounded``.  Raises CovarianceError for a Y that is not finite.
     """
+    C = to_fixed_axes(R_header_read, _tamed(Y, ceiling))
+    return bounded(C, floor_sigma_m, floor_sigma_rad, ceiling)
+
+
+def twist_covariance(
+    Y: Array, dt_s: float, floor_sigma_m: float, floor_sigma_rad: float, ceiling: float
+) -> Array:
+    """Return the covariance of a TwistWithCovariance from that of a step: ``Y / dt^2``.
+
+    The twist is ``log(T_ref_read) / dt``, along the axes of the reading and constant over the
+    step; to first order in the error and for a short step (times ``Jr^-1``, right Jacobian of the
+    step, for a long one), so that ``dt^2`` times it is the covariance of the step again, which is
+    what fuse makes of it.  Y: (6, 6), ordered (u, omega), reading side.  Returns (6, 6) in
+    m^2/s^2 and rad^2/s^2 within the bounds of ``bounded``, whose floors are those of the pose
+    over dt.  Raises CovarianceError for a Y that is not finite.
+    """
+    C = _tamed(_tamed(Y, ceiling * dt_s**2) / dt_s**2, ceiling)
+    return bounded(C, floor_sigma_m / dt_s, floor_sigma_rad / dt_s, ceiling)
+
+
+def bounded(C: Array, floor_sigma_m: float, floor_sigma_rad: float, ceiling: float) -> Array:
+    """Return C between the floors D = diag(floor_sigma_m^2, floor_sigma_rad^2) and the ceiling.
+
+    C: (6, 6), finite.  Returns a matrix that is exactly symmetric, positive definite, and
+    ``D <= C <= ceiling I`` in the sense of positive semidefinite differences; C itself where it is
+    so already.  A floor above the ceiling is lowered to it.
+    """
+    ceiling *= 1.0 - 1e-9  # so that rounding does not pass it
+    unit = np.minimum(np.repeat([floor_sigma_m, floor_sigma_rad], 3), np.sqrt(0.999 * ceiling))
+    C = _scaled(_clamped(_scaled(C, 1.0 / unit), 1.0, np.inf), unit)
+    if np.linalg.norm(C, 2) > ceiling:
+        D = np.diag(unit**2)
+        room = np.sqrt(ceiling - unit**2)
+        C = D + _scaled(_clamped(_scaled(C - D, 1.0 / room), 0.0, 1.0), room)
+    return _clamped(C, _CONDITION * float(np.linalg.norm(C, 2)), np.inf)
+
+
+def principal_axes(C: Array) -> tuple[Array, Array]:
+    """Return the standard deviations (3,) of a (3, 3) covariance, largest first, and their axes.
+
+    The axes are the columns of a rotation (3, 3); the first points where its largest entry is
+    positive, so that it does not flip from one answer to the next.
+    """
+    values, vectors = np.linalg.eigh(C)
+    axes = vectors[:, ::-1].copy()
+    axes *= np.sign(axes[np.abs(axes).argmax(axis=0), range(3)])
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return np.sqrt(np.maximum(values[::-1], 0.0)), axes
+
+
+def _tamed(Y: Array, ceiling: float) -> Array:
+    """Return a finite Y, exactly symmetric and not so large that products of it overflow."""
     if np.shape(Y) != (6, 6) or not np.isfinite(Y).all():
         raise CovarianceError("the covariance is not finite")
-    C = to_fixed_axes(R_header_read, Y)
-    unit = np.repeat([floor_sigma_m, floor_sigma_rad], 3)
-    unit2 = np.outer(unit, unit)
-    C = unit2 * _clamped(C / unit2, 1.0, np.inf)
-    largest = min(float(np.linalg.norm(C, 2)), ceiling)
-    return _clamped(C, _CONDITION * largest, ceiling)
+    largest = float(np.abs(Y).max())
+    scale = min(1.0, _HUGE * ceiling / largest) if largest > 0.0 else 1.0
+    return symmetrized(np.asarray(Y, dtype=np.float64) * scale)
+
+
+def _scaled(C: Array, unit: Array) -> Array:
+    """Return ``diag(unit) C diag(unit)``."""
+    return np.asarray(unit[:, None] * C * unit)
 
 
 def _clamped(A: Array, low: float, high: float) -> Array:

@@ -1,41 +1,75 @@
-"""What the node has seen, as diagnostic_msgs/DiagnosticArray."""
+"""What the node has seen, as diagnostic_msgs/DiagnosticArray; every key: docs/diagnostics.md."""
 
 from __future__ import annotations
 
 import time
 from collections import Counter, deque
+from typing import NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from cello3d_ros.config import NodeConfig
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.ros.covariances import N_SIGMA, principal_axes
 from cello3d_ros.ros.messages import time_of
 from cello3d_ros.ros.tracker import Answer
 
 ANSWERED, REFERENCE, WAITING, INACTIVE = "answered", "reference", "waiting", "inactive"
+OK, WARN, ERROR = 0, 1, 2
 
 _WINDOW = 200  # latencies remembered
+_RATE_WINDOW_S = 5.0
+_LEVELS: tuple[bytes, ...] = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
+
+
+class Verdict(NamedTuple):
+    """How far an answer is to be trusted: OK, WARN or ERROR, and why in one sentence."""
+
+    level: int
+    sentence: str
+
+
+def judged(C: Array, is_unknown: bool, config: NodeConfig) -> Verdict:
+    """Judge an answer by its covariance (6, 6), as published, and by its kin in the model."""
+    longest_m = N_SIGMA * float(principal_axes(C[:3, :3])[0][0])
+    level, reasons = OK, []
+    for worse, name in ((WARN, "warn_sigma_m"), (ERROR, "error_sigma_m")):
+        if longest_m > (limit_m := getattr(config, name)):
+            level = worse
+            reasons = [f"3 sigma are {longest_m:.3g} m, more than node.{name} {limit_m:g}"]
+    if is_unknown:
+        level = max(level, WARN)
+        reasons.append("out of distribution: the pair is unlike all that the model has seen")
+    return Verdict(level, "; ".join(reasons) or "answered")
 
 
 class Statistics:
     """Counts since the start, latencies of the last answers and the last answer itself."""
 
-    def __init__(self, model_name: str, n_serious_failures: int) -> None:
+    def __init__(self, model_name: str) -> None:
         self._model_name = model_name
-        self._n_serious = n_serious_failures
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self._latencies_s: deque[float] = deque(maxlen=_WINDOW)
         self._ages_s: deque[float] = deque(maxlen=_WINDOW)
+        self._received_s: deque[float] = deque(maxlen=_WINDOW)
+        self._answered_s: deque[float] = deque(maxlen=_WINDOW)
         self._last_event, self._last_stamp_ns = INACTIVE, 0
         self._last_failure = ""
         self._n_failed_in_a_row = 0
+        self._verdict = Verdict(OK, "answered")
         self._answer: dict[str, str] = {}
 
     def listen(self, is_listening: bool) -> None:
         """Note that the node has begun, or ceased, to listen."""
         self._last_event, self._last_stamp_ns = WAITING if is_listening else INACTIVE, 0
         self._n_failed_in_a_row = 0
+
+    def receive(self) -> None:
+        """Count a cloud that came."""
+        self.counts["received"] += 1
+        self._received_s.append(time.monotonic())
 
     def fail(self, stamp_ns: int, reason: str, sentence: str) -> None:
         """Count a cloud without an answer."""
@@ -49,33 +83,51 @@ class Statistics:
         self.counts["references"] += 1
         self._last_event, self._last_stamp_ns = REFERENCE, stamp_ns
 
-    def answer(self, answer: Answer, C: Array, received_s: float, now_ns: int) -> None:
+    def answer(
+        self, answer: Answer, C: Array, verdict: Verdict, received_s: float, now_ns: int
+    ) -> None:
         """Count an answer.  C: (6, 6), as published; received_s: time.monotonic() of the cloud."""
         self.counts["answered"] += 1
         self._last_event, self._last_stamp_ns = ANSWERED, answer.stamp_ns
         self._n_failed_in_a_row = 0
-        self._latencies_s.append(time.monotonic() - received_s)
+        self._verdict = verdict
+        self._answered_s.append(now_s := time.monotonic())
+        self._latencies_s.append(now_s - received_s)
         self._ages_s.append(1e-9 * (now_ns - answer.stamp_ns))
         self._answer = _described(answer, C)
 
     def message(
-        self, name: str, now_ns: int, n_restarts: int, n_clock_jumps: int
+        self,
+        name: str,
+        now_ns: int,
+        config: NodeConfig,
+        n_restarts: int,
+        last_restart: str,
+        n_clock_jumps: int,
     ) -> DiagnosticArray:
         """Return the message of now: level, one sentence, keys and values."""
-        status = DiagnosticStatus(name=name, level=self._level(), message=self._sentence())
+        verdict = self._judged(config.max_failures)
+        status = DiagnosticStatus(
+            name=name, level=_LEVELS[verdict.level], message=verdict.sentence
+        )
         values = {
             "last_event": self._last_event,
             "last_stamp_ns": str(self._last_stamp_ns),
             "last_failure": self._last_failure,
             "received": str(self.counts["received"]),
             "answered": str(self.counts["answered"]),
+            "references": str(self.counts["references"]),
             "dropped": str(sum(self.dropped.values())),
             **{f"dropped.{reason}": str(n) for reason, n in sorted(self.dropped.items())},
             "odometry_received": str(self.counts["odometry"]),
             "odometry_rejected": str(self.counts["odometry_rejected"]),
             "clock_jumps": str(n_clock_jumps),
             "chain_restarts": str(n_restarts),
+            "last_restart": last_restart,
             "model": self._model_name,
+            "covariance_mode": config.covariance_mode,
+            "rate_hz.received": f"{_rate_hz(self._received_s):.2f}",
+            "rate_hz.answered": f"{_rate_hz(self._answered_s):.2f}",
             **_quantiles("latency_ms", self._latencies_s),
             **_quantiles("age_ms", self._ages_s),
             **self._answer,
@@ -85,28 +137,24 @@ class Statistics:
         message.header.stamp = time_of(now_ns)
         return message
 
-    def _level(self) -> bytes:
-        level: bytes = DiagnosticStatus.OK
-        if self._n_failed_in_a_row >= self._n_serious:
-            level = DiagnosticStatus.ERROR
-        elif self._n_failed_in_a_row or self._last_event == WAITING:
-            level = DiagnosticStatus.WARN
-        return level
-
-    def _sentence(self) -> str:
+    def _judged(self, n_serious_failures: int) -> Verdict:
         if self._n_failed_in_a_row:
-            return f"no answer: {self._last_failure}"
-        return {
-            WAITING: "waiting for clouds and odometry",
-            INACTIVE: "inactive: not listening",
-            REFERENCE: "the next cloud is registered to this one",
-        }.get(self._last_event, "answered")
+            is_serious = self._n_failed_in_a_row >= n_serious_failures
+            return Verdict(ERROR if is_serious else WARN, f"no answer: {self._last_failure}")
+        if self._last_event == WAITING:
+            return Verdict(WARN, "waiting for clouds and odometry")
+        if self._last_event == INACTIVE:
+            return Verdict(OK, "inactive: not listening")
+        if self._last_event == REFERENCE:
+            return Verdict(OK, "the next cloud is registered to this one")
+        return self._verdict
 
 
 def _described(answer: Answer, C: Array) -> dict[str, str]:
-    """Return the last answer in words; ``weakest`` is the direction of the largest variance."""
+    """Return the last answer in words; directions are those of the largest variance."""
     found = answer.estimate
-    values, vectors = np.linalg.eigh(C[:3, :3])
+    (sigma_m, axes), (sigma_rad, turns) = principal_axes(C[:3, :3]), principal_axes(C[3:, 3:])
+    eigenvalues = np.asarray(np.linalg.eigvalsh(C)[::-1], dtype=np.float64)
     return {
         "reference_stamp_ns": str(answer.reference_ns),
         "guess": answer.guess,
@@ -116,9 +164,14 @@ def _described(answer: Answer, C: Array) -> dict[str, str]:
         "associations": str(found.registration.n_associations),
         "nearest_rho": f"{found.nearest_rho:.6g}",
         "effective_neighbors": f"{found.effective_neighbors:.3f}",
-        "weakest_sigma_m": f"{np.sqrt(values[-1]):.6g}",
-        "weakest_direction": " ".join(f"{value:.3f}" for value in vectors[:, -1]),
-        "weakest_eigenvalue": f"{np.linalg.eigvalsh(C)[-1]:.6g}",
+        "out_of_distribution": str(found.is_unknown).lower(),
+        "long_axis_3_sigma_m": f"{N_SIGMA * sigma_m[0]:.6g}",
+        "weakest_sigma_m": f"{sigma_m[0]:.6g}",
+        "weakest_direction": _numbers(axes[:, 0], "{:.3f}"),
+        "weakest_sigma_rad": f"{sigma_rad[0]:.6g}",
+        "weakest_rotation": _numbers(turns[:, 0], "{:.3f}"),
+        "weakest_eigenvalue": f"{eigenvalues[0]:.6g}",
+        "eigenvalues": _numbers(eigenvalues, "{:.4g}"),
         **_offset(answer.offset),
     }
 
@@ -133,8 +186,19 @@ def _offset(offset: Array | None) -> dict[str, str]:
     }
 
 
+def _numbers(values: Array, form: str) -> str:
+    return " ".join(form.format(value) for value in values)
+
+
 def _quantiles(name: str, seconds: deque[float]) -> dict[str, str]:
     if not seconds:
         return {}
     p50, p95 = np.percentile(seconds, [50, 95]) * 1e3
     return {f"{name}.p50": f"{p50:.1f}", f"{name}.p95": f"{p95:.1f}"}
+
+
+def _rate_hz(times_s: deque[float]) -> float:
+    """Return events per second over the last ones and the time since, at most 5 s."""
+    now_s = time.monotonic()
+    recent = [t for t in times_s if now_s - t <= _RATE_WINDOW_S]
+    return (len(recent) - 1) / (now_s - recent[0]) if len(recent) > 1 else 0.0

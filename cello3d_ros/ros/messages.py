@@ -6,11 +6,12 @@ import array
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
+from builtin_interfaces.msg import Duration, Time
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2, PointField
 
+from cello3d_ros.errors import ConfigError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import to_fixed_axes
 from cello3d_ros.geometry.se3 import Array
@@ -29,6 +30,12 @@ def time_of(stamp_ns: int) -> Time:
     """Return a stamp as a builtin_interfaces/Time."""
     sec, nanosec = divmod(int(stamp_ns), 1_000_000_000)
     return Time(sec=sec, nanosec=nanosec)
+
+
+def duration_of(seconds: float) -> Duration:
+    """Return a builtin_interfaces/Duration, rounded to nanoseconds."""
+    sec, nanosec = divmod(round(seconds * 1e9), 1_000_000_000)
+    return Duration(sec=sec, nanosec=nanosec)
 
 
 def pose_from(pose: Pose) -> Array:
@@ -82,12 +89,62 @@ def pose_with_covariance(
     stamp_ns: int, frame_id: str, T: Array, covariance: Array
 ) -> PoseWithCovarianceStamped:
     """Return the message of a pose and its covariance in the ROS convention (ros_covariance)."""
-    cells = np.ascontiguousarray(covariance, dtype=np.float64).reshape(36)
-    if not np.isfinite(cells).all() or not se3.is_rigid(T):
-        raise CovarianceError("the pose or its covariance is not finite")
+    if not se3.is_rigid(T):
+        raise CovarianceError("the pose is not finite")
     message = PoseWithCovarianceStamped()
     message.header.stamp = time_of(stamp_ns)
     message.header.frame_id = frame_id
     message.pose.pose = pose_to(T)
-    message.pose.covariance = cells
+    message.pose.covariance = _cells(covariance)
     return message
+
+
+def full_odometry(
+    pose: PoseWithCovarianceStamped, child_frame_id: str, twist: Array, covariance: Array
+) -> Odometry:
+    """Return nav_msgs/Odometry with a pose, a twist and both covariances.
+
+    pose: of ``child_frame_id`` in its header's frame.  twist: (6,), (v, omega) of the child along
+    its own axes; covariance: (6, 6), along the same axes (twist_covariance).
+    """
+    twist = np.asarray(twist, dtype=np.float64)
+    if not np.isfinite(twist).all():
+        raise CovarianceError("the twist is not finite")
+    message = Odometry(header=pose.header, child_frame_id=child_frame_id, pose=pose.pose)
+    linear, angular = message.twist.twist.linear, message.twist.twist.angular
+    linear.x, linear.y, linear.z = (float(value) for value in twist[:3])
+    angular.x, angular.y, angular.z = (float(value) for value in twist[3:])
+    message.twist.covariance = _cells(covariance)
+    return message
+
+
+def transform_to(stamp_ns: int, frame_id: str, child_frame_id: str, T: Array) -> TransformStamped:
+    """Return the pose of ``child_frame_id`` in ``frame_id`` as TF has it."""
+    message = TransformStamped(child_frame_id=child_frame_id)
+    message.header.stamp = time_of(stamp_ns)
+    message.header.frame_id = frame_id
+    pose = pose_to(T)
+    p, t = pose.position, message.transform.translation
+    t.x, t.y, t.z = p.x, p.y, p.z
+    message.transform.rotation = pose.orientation
+    return message
+
+
+def _cells(covariance: Array) -> Array:
+    """Return 36 finite doubles, row by row."""
+    cells = np.ascontiguousarray(covariance, dtype=np.float64).reshape(36)
+    if not np.isfinite(cells).all():
+        raise CovarianceError("the covariance is not finite")
+    return cells
+
+
+def tf_message_type(parameter: str) -> Any:
+    """Return tf2_msgs/TFMessage, which only some settings need.  Raises ConfigError without it."""
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:
+        raise ConfigError(
+            f"parameter {parameter} needs tf2_msgs, which is not installed: "
+            "apt install ros-jazzy-tf2-msgs, or leave it false"
+        ) from None
+    return TFMessage

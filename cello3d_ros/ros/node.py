@@ -4,8 +4,9 @@
 stamp) in the frame of the sensor at the reference, by default the cloud answered before;
 header.frame_id is the frame of the cloud.  ``~/pose`` is the chain of them since its last restart,
 in the frame of the odometry, where it starts without error at the odometry's pose; its errors
-accumulate and must not be fused as if they were independent.  Nothing is published for a cloud
-without an answer; ``/diagnostics`` says why.
+accumulate and must not be fused as if they were independent.  ``~/odometry`` is that chain with
+the velocity of the last registration.  Nothing is published for a cloud without an answer;
+``/diagnostics`` says why.
 
 This module is the node's life and its wiring: configure loads and warms up, activate listens.
 What is heard goes to the worker (worker.py), its answers to the outputs (outputs.py).
@@ -73,10 +74,10 @@ class CovarianceNode(ManagedNode):
         topics(config.node)  # what is not installed is better missed before the warming up
         self.get_logger().info("warming up; a first start compiles the kernels")
         warm_up(self._model, config)
-        self._statistics = Statistics(path.name, config.node.max_failures)
+        self._statistics = Statistics(path.name)
         self._worker = Worker(self._model, config, self._skip, self._logbook.warn)
         self.configured.callback(self._forget)
-        self._outputs = Outputs(self)
+        self._outputs = Outputs(self, config.node)
         self.configured.callback(self._outputs.destroy)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.configured.callback(self.destroy_publisher, self._diagnostics)
@@ -122,7 +123,7 @@ class CovarianceNode(ManagedNode):
     def _declared(self, model: Model) -> Config:
         if self._defaults is not None:
             parameters.release(self, self._defaults)
-        self._defaults = Config(**{name: getattr(model.pipeline, name) for name in PIPELINE})
+        self._defaults = config_of(model)
         config = parameters.declare(self, self._defaults)
         if config.grid != model.pipeline.grid:
             raise ConfigError(f"parameters grid.* must be the model's, {model.pipeline.grid}")
@@ -156,7 +157,7 @@ class CovarianceNode(ManagedNode):
         self._worker.hear_reference(message)
 
     def _on_cloud(self, message: PointCloud2) -> None:
-        self._statistics.counts["received"] += 1
+        self._statistics.receive()
         self._worker.hear_cloud(message, self._now_ns())
         if self._worker.has_work:
             self._work_is_there.trigger()
@@ -200,8 +201,8 @@ class CovarianceNode(ManagedNode):
 
     def _publish(self, job: Job, answer: Answer) -> None:
         assert self._config is not None
-        C = self._outputs.publish(job, answer, self._config.node)
-        self._statistics.answer(answer, C, job.received_s, self._now_ns())
+        C, verdict = self._outputs.publish(job, answer, self._config.node)
+        self._statistics.answer(answer, C, verdict, job.received_s, self._now_ns())
 
     def _skip(self, skip: Skip) -> None:
         self._statistics.fail(skip.stamp_ns, skip.reason, skip.sentence)
@@ -210,10 +211,15 @@ class CovarianceNode(ManagedNode):
         self._publish_diagnostics()
 
     def _publish_diagnostics(self) -> None:
-        name = f"{self.get_name()}: registration"
+        assert self._config is not None
         self._diagnostics.publish(
             self._statistics.message(
-                name, self._now_ns(), self._worker.n_restarts, self._worker.n_clock_jumps
+                f"{self.get_name()}: registration",
+                self._now_ns(),
+                self._config.node,
+                self._worker.n_restarts,
+                self._worker.last_restart,
+                self._worker.n_clock_jumps,
             )
         )
 
@@ -238,5 +244,11 @@ class CovarianceNode(ManagedNode):
         self._warn_of_differences(self._config, self._model)
 
     def _warn_of_differences(self, config: Config, model: Model) -> None:
-        for difference in differences(config, model.pipeline):
+        for difference in differences(config, config_of(model)):
             self.get_logger().warning(f"not as the model was trained: {difference}")
+
+
+def config_of(model: Model) -> Config:
+    """Return the settings that a model was trained with, and the defaults of all others."""
+    sections = {name: getattr(model.pipeline, name) for name in PIPELINE}
+    return Config(**sections, sampling=model.sampling)

@@ -16,6 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import MarkerArray
 
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry.se3 import Array, interpolate
@@ -27,6 +28,8 @@ from cello3d_ros.ros.diagnostics import ANSWERED, WAITING
 _TYPES: dict[str, Any] = {
     "relative_pose": PoseWithCovarianceStamped,
     "pose": PoseWithCovarianceStamped,
+    "odometry": Odometry,
+    "markers": MarkerArray,
     "diagnostics": DiagnosticArray,
 }
 _N_ODOMETRY = 4  # odometry messages for each cloud
@@ -59,6 +62,8 @@ class Replay:
     T_odom: dict[int, Array] = field(default_factory=dict)
     relative: dict[int, Pose] = field(default_factory=dict)
     poses: dict[int, Pose] = field(default_factory=dict)
+    odometry: dict[int, Odometry] = field(default_factory=dict)
+    markers: dict[int, MarkerArray] = field(default_factory=dict)
     status: dict[int, dict[str, str]] = field(default_factory=dict)
     last_status: dict[str, str] = field(default_factory=dict)
     raw: list[tuple[str, str, int, bytes]] = field(default_factory=list)
@@ -75,7 +80,8 @@ class Replay:
         """Return whether the node has said all it will say of a cloud."""
         event = self.status.get(stamp_ns, {}).get("last_event", WAITING)
         if event == ANSWERED:
-            return stamp_ns in self.relative and stamp_ns in self.poses
+            heard = (self.relative, self.poses, self.odometry)
+            return all(stamp_ns in messages_of for messages_of in heard)
         return event != WAITING
 
 
@@ -165,6 +171,12 @@ class Player:
             message: Any = deserialize_message(raw, kind)
             if name == "diagnostics":
                 self._note_status(message)
+                return
+            if name == "markers":
+                self.replay.markers[messages.stamp_ns_of(message.markers[0])] = message
+                return
+            if name == "odometry":
+                self.replay.odometry[messages.stamp_ns_of(message)] = message
                 return
             pose = Pose(
                 messages.pose_from(message.pose.pose),

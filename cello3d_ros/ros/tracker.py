@@ -13,14 +13,20 @@ import numpy as np
 from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import NodeConfig, Pipeline
 from cello3d_ros.covariance.estimator import Estimate, estimate
+from cello3d_ros.covariance.methods import METHODS, MethodSettings
 from cello3d_ros.covariance.model import Model
+from cello3d_ros.covariance.novelty import rho_limit
 from cello3d_ros.errors import CloudError, ModelError, NoOverlapError, RegistrationError
 from cello3d_ros.geometry.gaussian import GaussianPose, compound_right, is_positive_definite
 from cello3d_ros.geometry.se3 import Array, inverse
+from cello3d_ros.ros.covariances import CovarianceError
 from cello3d_ros.ros.external import DisagreementError, External, checked
 from cello3d_ros.ros.frames import seen_from_base
 from cello3d_ros.ros.guess import CONSTANT_VELOCITY, EXTERNAL, ODOMETRY, Motion, Place
 from cello3d_ros.ros.pairing import Frame, Link, Map, makes_keyframe
+
+#: Names of METHODS by ``node.covariance_mode``.
+METHOD_OF = {"cello3d": "model"} | {name: name for name in METHODS}
 
 _ORIGIN = np.eye(4)
 
@@ -68,6 +74,7 @@ class Tracker:
 
     def __init__(self, model: Model, pipeline: Pipeline, config: NodeConfig) -> None:
         self.model, self.pipeline, self.config = model, pipeline, config
+        self._rho_limit = rho_limit(model, config.unknown_quantile)
         self.n_failures = 0  # in a row, against the present reference
         self.n_restarts = 0
         self.last_restart = ""
@@ -171,11 +178,9 @@ class Tracker:
             limit = self.config.max_external_offset
             external = checked(*clouds, T_init, self.pipeline.icp, limit, rng)
         found = estimate(
-            *clouds,
-            T_init,
-            self.model,
-            self.pipeline,
-            rng,
+            *(*clouds, T_init, self.model, self.pipeline, rng),
+            method=METHOD_OF[self.config.covariance_mode],
+            settings=self._settings(),
             registration=None if external is None else external.registration,
         )
         if external is not None:
@@ -249,6 +254,16 @@ class Tracker:
             child_frame_id=child,
         )
 
+    def _settings(self) -> MethodSettings:
+        config = self.config
+        return MethodSettings(
+            sigma_m=config.sensor_sigma_m,
+            n_registrations=config.n_registrations,
+            rho_limit=self._rho_limit,
+            widen_unknown=config.inflate_unknown,
+            scale=config.scale,
+        )
+
     def _fail(self, frame: Frame) -> None:
         self.n_failures += 1
         if self.n_failures >= self.config.max_failures:
@@ -281,6 +296,7 @@ def reason_of(error: Exception) -> str:
         RegistrationError: "registration",
         ModelError: "beyond_model",
         CloudError: "too_few_points",
+        CovarianceError: "covariance",
     }
     return next((name for kind, name in names.items() if isinstance(error, kind)), "internal")
 

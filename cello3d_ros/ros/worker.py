@@ -61,6 +61,11 @@ class Worker:
         return self._tracker.n_restarts
 
     @property
+    def last_restart(self) -> str:
+        """Why the last one was given up."""
+        return self._tracker.last_restart
+
+    @property
     def has_work(self) -> bool:
         """Whether a cloud waits, with or without its odometry."""
         return len(self._intake) > 0

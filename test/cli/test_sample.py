@@ -11,6 +11,7 @@ import sys
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 from cello3d_ros.cli.main import main
 from cello3d_ros.geometry.se3 import exp, inverse, transform
@@ -229,6 +230,46 @@ def test_two_recordings_of_one_name_are_refused(tmp_path, recordings, capsys):
     assert sample(tmp_path, [recordings[0], other]) == 1
     assert "two recordings are named 'one'" in capsys.readouterr().err
     assert not (tmp_path / "dataset").exists()
+
+
+def test_sampling_keeps_blas_to_one_thread(tmp_path, recordings, monkeypatch):
+    from cello3d_ros.learning import sampling
+
+    seen, register_many = set(), sampling.register_many
+
+    def watched(*arguments):
+        seen.update(x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas")
+        return register_many(*arguments)
+
+    monkeypatch.setattr(sampling, "register_many", watched)
+    assert sample(tmp_path, recordings[:1]) == 0
+    assert seen == {1}
+
+
+def test_another_recording_of_a_name_is_refused_by_what_is_in_it(tmp_path, recordings, capsys):
+    assert sample(tmp_path, recordings[:1]) == 0
+    before = contents(tmp_path)
+    other = write_kitti(tmp_path / "elsewhere" / "one", 7)  # as many scans
+    assert sample(tmp_path, [other]) == 1
+    assert "holds another recording named 'one': fingerprint is" in capsys.readouterr().err
+    poses = tmp_path / "one" / "poses.txt"
+    rows = np.loadtxt(poses)
+    rows[1:, 3] += 1e-9  # the same scans, poses estimated anew
+    np.savetxt(poses, rows)
+    assert sample(tmp_path, recordings[:1]) == 1
+    assert "holds another recording named 'one'" in capsys.readouterr().err
+    assert contents(tmp_path) == before
+
+
+def test_a_dataset_from_before_fingerprints_is_resumed_and_learns_them(tmp_path, recordings):
+    assert sample(tmp_path, recordings[:1]) == 0
+    before, file = contents(tmp_path), tmp_path / "dataset" / "manifest.json"
+    manifest = json.loads(file.read_text())
+    known = manifest["recordings"]["one"].pop("fingerprint")
+    file.write_text(json.dumps(manifest))
+    assert sample(tmp_path, recordings[:1]) == 0
+    assert contents(tmp_path) == before
+    assert json.loads(file.read_text())["recordings"]["one"]["fingerprint"] == known
 
 
 def test_a_recording_that_ends_early_keeps_the_pairs_before(

@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +26,7 @@ def fill(path: Path, names: list[str], seed: int = 0, **settings: object) -> Pat
     sampling = SamplingConfig(**settings)  # type: ignore[arg-type]
     dataset = open_dataset(path, Pipeline(), sampling, create=True)
     for name in names:
+        dataset.add_recording(name, {"n_scans": 7, "fingerprint": f"of {name}"})
         rng = np.random.default_rng([seed, *name.encode()])
         for i in range(6):
             xi = rng.normal(size=(40, 6)) * 0.01
@@ -95,6 +102,114 @@ def test_validation_and_excluded_recordings_never_enter_training(
     again = load_model(outs[1])
     for name in ("mean", "scale", "covariances"):
         np.testing.assert_array_equal(getattr(model, name), getattr(again, name))
+
+
+def test_what_is_excluded_is_not_even_opened(folder: Path, tmp_path: Path) -> None:
+    one, two = tmp_path / "one.npz", tmp_path / "two.npz"
+    words = ("--validation", "hall_s3", "--exclude", "wood_*")
+    cello3d_train(folder, "--out", one, *words)
+    for pair in (folder / "pairs").glob("wood_*"):
+        pair.write_bytes(b"of no use to anybody")
+    cello3d_train(folder, "--out", two, *words)
+    assert one.read_bytes() == two.read_bytes()
+    with pytest.raises(DatasetError, match="is damaged"):
+        cello3d_train(folder, "--out", two, "--validation", "wood_*")
+
+
+@pytest.mark.parametrize("use", ["--validation", "--exclude"])
+def test_one_recording_under_two_names_has_one_use(folder: Path, tmp_path: Path, use: str) -> None:
+    other = fill(tmp_path / "other", ["again"])
+    manifest = other / "manifest.json"
+    manifest.write_text(manifest.read_text().replace("of again", "of hall_s1"))
+    with pytest.raises(DatasetError, match="'again' and 'hall_s1' are the same recording under"):
+        cello3d_train(folder, other, "--out", tmp_path / "model.npz", use, "hall_s1")
+    assert not (tmp_path / "model.npz").exists()
+    both = ("--exclude", "hall_s1", "again")
+    cello3d_train(folder, other, "--out", tmp_path / "model.npz", *both)
+
+
+def test_two_recordings_under_one_name_do_not_mix(folder: Path, tmp_path: Path) -> None:
+    other = fill(tmp_path / "other", ["hall_s1"])
+    manifest = other / "manifest.json"
+    manifest.write_text(manifest.read_text().replace("of hall_s1", "of another"))
+    with pytest.raises(DatasetError, match="other: 'hall_s1' is another recording than that"):
+        cello3d_train(folder, other, "--out", tmp_path / "model.npz")
+
+
+def test_pairs_that_the_manifest_does_not_name_are_refused(folder: Path, tmp_path: Path) -> None:
+    other = fill(tmp_path / "other", ["secret_test"])
+    for pair in (other / "pairs").iterdir():
+        pair.rename(folder / "pairs" / pair.name)
+    with pytest.raises(DatasetError, match="pairs of 'secret_test', which its manifest does not"):
+        cello3d_train(folder, "--out", tmp_path / "model.npz")
+
+
+def test_an_older_manifest_without_fingerprints_is_trained_on(
+    folder: Path, tmp_path: Path
+) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    for facts in manifest["recordings"].values():
+        del facts["fingerprint"]
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    cello3d_train(folder, "--out", tmp_path / "model.npz", "--validation", "*_s3")
+    assert load_model(tmp_path / "model.npz").n_examples == 3 * 5 * 2
+
+
+def test_a_learning_curve_stands_beside_the_model(folder: Path, tmp_path: Path) -> None:
+    from matplotlib.image import imread
+
+    for validation in ([], ["--validation", "*_s3"]):
+        cello3d_train(folder, "--out", tmp_path / "model.npz", *validation)
+        picture = imread(tmp_path / "model.learning_curve.png")
+        assert picture.shape[0] > 300
+        assert picture.std() > 0.01  # something is drawn
+    first = (tmp_path / "model.learning_curve.png").read_bytes()
+    cello3d_train(folder, "--out", tmp_path / "model.npz", *validation)
+    assert (tmp_path / "model.learning_curve.png").read_bytes() == first
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "model.learning_curve.png", "model.npz", "set",
+    ]  # fmt: skip
+
+
+def test_the_papers_descent_is_a_flag(folder: Path, tmp_path: Path) -> None:
+    cello3d_train(folder, "--out", tmp_path / "model.npz", "--optimizer", "sgd")
+    training = load_model(tmp_path / "model.npz").provenance["training"]
+    assert (training["optimizer"], training["learning_rate"]) == ("sgd", 1e-5)
+
+
+def test_ctrl_c_in_training_writes_the_best_so_far(tmp_path: Path) -> None:
+    out, dataset = tmp_path / "model.npz", fill(tmp_path / "set", ["a", "b", "c"])
+    (tmp_path / "c.yaml").write_text(
+        "training: {optimizer: sgd, learning_rate: 1.0e-6, max_iterations: 1000000}"
+    )
+    command = [sys.executable, "-m", "cello3d_ros.cli.main", "train", dataset, "--out", out]
+    controller, terminal = os.openpty()
+    process = subprocess.Popen(
+        [*map(str, command), "--config", str(tmp_path / "c.yaml")],
+        stdout=subprocess.PIPE,
+        stderr=terminal,
+    )
+    os.close(terminal)
+    shown = b""
+    while b"step 3:" not in shown:  # a terminal sees progress
+        shown += os.read(controller, 1000)
+    process.send_signal(signal.SIGINT)
+    drain = threading.Thread(target=lambda: b"".join(iter(lambda: _read(controller), b"")))
+    drain.start()
+    printed, _ = process.communicate(timeout=120)
+    drain.join()
+    assert process.returncode == 0
+    assert b"15 pairs of 3 recordings" in printed
+    model = load_model(out)
+    assert 3 <= model.provenance["iterations"] < 1000000
+    assert 0 <= model.provenance["best_iteration"] <= model.provenance["iterations"]
+
+
+def _read(controller: int) -> bytes:
+    try:
+        return os.read(controller, 1000)
+    except OSError:  # the other end is closed
+        return b""
 
 
 def test_a_dataset_folder_may_be_what_is_validated_on(folder: Path, tmp_path: Path) -> None:

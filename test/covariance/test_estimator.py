@@ -5,8 +5,8 @@ from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import GridConfig, IcpConfig, OverlapConfig, Pipeline
 from cello3d_ros.covariance.description import describe, turns
 from cello3d_ros.covariance.estimator import estimate, registered_elsewhere
-from cello3d_ros.covariance.methods import METHODS
-from cello3d_ros.covariance.model import constant_model
+from cello3d_ros.covariance.methods import METHODS, MethodSettings
+from cello3d_ros.covariance.model import Model, constant_model
 from cello3d_ros.errors import ModelError, NoOverlapError, RegistrationError
 from cello3d_ros.geometry.gaussian import is_positive_definite
 from cello3d_ros.geometry.se3 import exp, inverse, log, transform
@@ -150,3 +150,59 @@ def test_another_grid_than_the_models_is_refused(pair):
             other,
             np.random.default_rng(0),
         )
+
+
+def two_examples(pair, far: float):
+    """A model of a small covariance near the pair and a large one; the pair is ``far`` away."""
+    d = describe(*pair, T_TRUE, PIPELINE).descriptors[0]
+    theta = np.zeros((1, len(d)))
+    theta[0, np.argmax(d)] = 1.0
+    place = (theta @ d)[0]
+    return Model(
+        theta=theta,
+        mean=np.zeros(len(d)),
+        scale=np.ones(len(d)),
+        projections=np.array([[place + far], [place + far + 100.0]]),
+        covariances=np.array([1e-6 * np.eye(6), 1e-2 * np.diag([1.0, 1, 1, 1e-6, 1, 1])]),
+    )
+
+
+@pytest.mark.parametrize("method", ["model", "hessian"])
+def test_an_answer_far_from_every_example_is_widened_to_their_mean(pair, method):
+    model, settings = two_examples(pair, 3.0), MethodSettings(rho_limit=4.0, widen_unknown=True)
+    assert settings.rho_limit < 9.0
+    rng = [np.random.default_rng(5) for _ in range(3)]
+    plain = estimate(*pair, T_TRUE, model, PIPELINE, rng[0], method)
+    found = estimate(*pair, T_TRUE, model, PIPELINE, rng[1], method, settings)
+    mean = model.covariances.mean(axis=0)
+    assert found.nearest_rho == plain.nearest_rho > settings.rho_limit
+    assert (plain.is_unknown, found.is_unknown) == (False, True)
+    for smaller in (plain.covariance, mean):
+        assert np.linalg.eigvalsh(found.covariance - smaller)[0] > -1e-15
+    assert np.linalg.eigvalsh(found.covariance - plain.covariance)[-1] > 1e-3
+    near = two_examples(pair, 0.5)
+    kept = estimate(*pair, T_TRUE, near, PIPELINE, rng[2], method, settings)
+    assert np.linalg.eigvalsh(kept.covariance)[-1] < 1e-3
+    assert not kept.is_unknown
+
+
+def test_an_answer_far_from_every_example_is_only_told_of_unless_it_is_to_be_widened(pair):
+    model = two_examples(pair, 3.0)
+    rng = [np.random.default_rng(5) for _ in range(2)]
+    plain = estimate(*pair, T_TRUE, model, PIPELINE, rng[0])
+    settings = MethodSettings(rho_limit=4.0)
+    found = estimate(*pair, T_TRUE, model, PIPELINE, rng[1], settings=settings)
+    np.testing.assert_array_equal(found.covariance, plain.covariance)
+    assert found.is_unknown
+
+
+def test_an_answer_is_scaled_last(pair):
+    model = two_examples(pair, 3.0)
+    plain, scaled = (
+        estimate(
+            *(*pair, T_TRUE, model, PIPELINE, np.random.default_rng(5)),
+            settings=MethodSettings(rho_limit=4.0, widen_unknown=True, scale=scale),
+        )
+        for scale in (1.0, 2.5)
+    )
+    np.testing.assert_array_equal(scaled.covariance, 2.5 * plain.covariance)

@@ -350,6 +350,33 @@ def test_roots_multiply_back_and_are_symmetric() -> None:
         g.matrix_sqrt(-EYE)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_the_larger_of_two_covariances_is_above_both_and_no_more_than_their_sum(seed) -> None:
+    A, B = covariances(2, np.random.default_rng(seed), 1e-4)
+    larger = g.larger(A, B)
+    scale = np.linalg.norm(larger, 2)
+    for other in (larger - A, larger - B, A + B - larger):
+        assert np.linalg.eigvalsh(other)[0] >= -1e-12 * scale
+    np.testing.assert_allclose(larger, g.larger(B, A), atol=1e-12 * scale)
+    np.testing.assert_array_equal(larger, larger.T)
+
+
+def test_the_larger_of_two_covariances_is_one_of_them_where_one_is_larger() -> None:
+    A, B = covariances(2, np.random.default_rng(18), 1e-4)
+    np.testing.assert_allclose(g.larger(A, A + B), A + B, rtol=0, atol=1e-18)
+    np.testing.assert_allclose(g.larger(A + B, A), A + B, rtol=0, atol=1e-18)
+    np.testing.assert_allclose(g.larger(A, 0 * B), A, rtol=0, atol=1e-18)
+
+
+def test_the_larger_of_two_covariances_does_not_depend_on_units_or_axes() -> None:
+    rng = np.random.default_rng(19)
+    A, B = covariances(2, rng)
+    M = rng.standard_normal((6, 6))
+    np.testing.assert_allclose(
+        g.larger(M @ A @ M.T, M @ B @ M.T), M @ g.larger(A, B) @ M.T, rtol=1e-9, atol=1e-9
+    )
+
+
 def test_arguments_stay_as_they_were() -> None:
     rng = np.random.default_rng(17)
     A, B, Ya, Yb = T1.copy(), T2.copy(), *covariances(2, rng, 0.01)

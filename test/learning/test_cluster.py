@@ -1,6 +1,7 @@
 """Sampling on real Dask schedulers and workers: processes of their own, on loopback."""
 
 import dataclasses
+import os
 import socket
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 from cello3d_ros.cli.main import main
 from cello3d_ros.config import IcpConfig, Pipeline, SamplingConfig, load_config, pipeline_of
@@ -147,6 +149,21 @@ def test_blocks_workers_and_ways_of_reading_do_not_change_a_bit(
         )
         assert_same(by_key(records, 7), local)
     assert sum(counts) == 7 * SAMPLING.n_samples
+
+
+def test_workers_keep_blas_to_one_thread(recording, cluster):
+    def blas_threads():  # travels by value: workers do not know this module
+        return {lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"}
+
+    with connected(cluster) as client:
+        records = sample_recording_on(
+            client, open_recording(recording), pairs(5, 2), job(recording), 20
+        )
+        by_key(records, 7)
+        used = list(client.run(blas_threads).values())
+    assert len(used) == 2
+    assert {1} in used
+    assert all(found in ({1}, {os.cpu_count()}) for found in used)  # or was given no task
 
 
 def test_only_what_is_asked_for_is_sampled(recording, cluster, local):

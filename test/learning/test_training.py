@@ -10,12 +10,18 @@ import pytest
 
 from cello3d_ros.config import CloudConfig, Pipeline, SamplingConfig, TrainingConfig
 from cello3d_ros.covariance.model import predict
-from cello3d_ros.errors import DatasetError
+from cello3d_ros.errors import ConfigError, DatasetError
 from cello3d_ros.geometry.gaussian import is_positive_definite, kl, matrix_sqrt
 from cello3d_ros.geometry.se3 import Array, adjoint, exp
 from cello3d_ros.learning.dataset import Dataset, PairRecord, open_dataset
-from cello3d_ros.learning.examples import Examples, load_examples
-from cello3d_ros.learning.loss import Problem, leave_out_problem, loss_and_gradient, predicted
+from cello3d_ros.learning.examples import Examples, feature_scaler, load_examples
+from cello3d_ros.learning.loss import (
+    Problem,
+    leave_out_problem,
+    loss_and_gradient,
+    median_rho,
+    predicted,
+)
 from cello3d_ros.learning.training import train
 
 PAPER = TrainingConfig(shape="none", theta="diagonal", mean_weight=0.0, regularization=1e-3)
@@ -300,6 +306,55 @@ def test_the_order_of_the_examples_does_not_change_predictions() -> None:
     one, two = train(examples, config).model, train(shuffled, config).model
     d = np.linspace(-1, 1, 5)
     np.testing.assert_allclose(predict(one, d).covariance, predict(two, d).covariance, rtol=1e-6)
+
+
+SGD = TrainingConfig(
+    shape="none", theta="diagonal", mean_weight=0.0, regularization=1e-3, optimizer="sgd"
+)
+
+
+def test_stochastic_descent_is_that_of_one_target_after_another_at_a_small_rate() -> None:
+    rate, examples = 1e-7, planted(60)
+    config = dataclasses.replace(SGD, learning_rate=rate, max_iterations=1)
+    judge = planted(60, 1)
+    problem = leave_out_problem(examples, config, *feature_scaler(examples)[:2])
+    theta = np.ones(10) / np.sqrt(median_rho(problem, np.ones(10)))
+    _, gradient = loss_and_gradient(theta, problem)
+    expected = theta - rate * len(problem.X) * (gradient + 2 * SGD.regularization * theta)
+    found = np.abs(np.diagonal(train(examples, config, judge).model.theta))
+    np.testing.assert_allclose(found - theta, expected - theta, rtol=1e-3)
+
+
+@pytest.mark.parametrize("form", ["diagonal", "low_rank", "upper_triangular"])
+def test_stochastic_descent_lowers_the_loss_on_planted_data(form: str) -> None:
+    config = dataclasses.replace(SGD, theta=form, learning_rate=1e-4, max_iterations=10)
+    training = train(planted(), config, planted(150, 1))
+    losses = np.array([loss for _, loss, _ in training.curve])
+    assert (np.diff(losses) < 0).all()
+    assert losses[-1] < losses[0] - 0.02
+    paper = train(planted(), dataclasses.replace(config, learning_rate=1e-5))
+    assert paper.curve[-1][1] < paper.curve[0][1]
+    again = train(planted(), config, planted(150, 1))
+    assert again.curve == training.curve
+    np.testing.assert_array_equal(again.model.theta, training.model.theta)
+
+
+def test_too_high_a_rate_is_one_sentence() -> None:
+    with pytest.raises(ConfigError, match=r"training.learning_rate must be less than 1e\+100"):
+        train(planted(60), dataclasses.replace(SGD, learning_rate=1e100))
+
+
+def test_the_curve_is_what_progress_was_told() -> None:
+    told: list[tuple[int, float, float]] = []
+    training = train(planted(60), PAPER, planted(60, 1), lambda *step: told.append(step))
+    assert list(training.curve) == told
+    assert [step for step, _, _ in told] == list(range(training.n_iterations + 1))
+    examples, config = planted(60), PAPER
+    problem = leave_out_problem(examples, config, *feature_scaler(examples)[:2])
+    step, loss, _ = told[training.best_iteration]
+    theta = np.diagonal(training.model.theta)
+    assert step == training.best_iteration
+    assert loss == pytest.approx(loss_and_gradient(theta, problem)[0], rel=1e-12)
 
 
 def test_an_interrupt_keeps_the_best_so_far() -> None:

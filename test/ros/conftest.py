@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from consumer_rules import complaints, of_pose, of_twist
 
 from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.geometry import se3
@@ -105,6 +106,9 @@ class Robot:
             assert (pose.C == pose.C.T).all()
             assert is_positive_definite(pose.C)
             assert np.linalg.eigvalsh(pose.C)[0] > 0.0
+            assert not complaints(pose.T.ravel(), pose.C)
+        for message in replay.odometry.values():
+            assert not [*of_pose(message), *of_twist(message)]
 
 
 @pytest.fixture(scope="session")

@@ -1,15 +1,23 @@
 """Launch, RViz and DDS files: as much as can be checked without those programs."""
 
+import ast
+import dataclasses
+import json
 import py_compile
+import re
 import xml.etree.ElementTree
 from pathlib import Path
 
 import pytest
 import yaml
 
+from cello3d_ros.config import Config, NodeConfig, config_from
 from cello3d_ros.ros.process import PROFILE, shared_file
 
 ROOT = Path(__file__).parents[2]
+LAUNCH = ROOT / "launch"
+EXAMPLES = sorted(ROOT.glob("config/examples/*.yaml"))
+OURS = "/covariance_node/"
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.glob("launch/*.launch.py")), ids=lambda p: p.name)
@@ -26,12 +34,120 @@ def test_launch_files_describe_something(path) -> None:
     assert names["generate_launch_description"]().entities
 
 
+def calls(path: Path, function: str) -> list[dict[str, ast.expr]]:
+    """Keyword arguments of each call of a function in a file."""
+    return [
+        {word.arg: word.value for word in node.keywords if word.arg}
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        if node.func.id == function
+    ]
+
+
+def constant(path: Path, name: str):
+    """Value of a literal at the top of a file."""
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name:
+            return ast.literal_eval(node.value)
+    raise AssertionError(f"{path} has no {name}")
+
+
+def test_launch_starts_what_is_installed_and_sets_parameters_that_are_there() -> None:
+    path = LAUNCH / "cello3d.launch.py"
+    ours = [c for c in calls(path, "Node") if ast.literal_eval(c["package"]) == "cello3d_ros"]
+    assert len(ours) == 1
+    executable = ast.literal_eval(ours[0]["executable"])
+    assert f'"{executable} = cello3d_ros' in (ROOT / "setup.py").read_text()
+    settings = set(re.findall(r'"node\.(\w+)"', path.read_text()))
+    named = re.search(r"for name in \(([^)]*)\):\n\s+if given", path.read_text())
+    settings |= set(re.findall(r"\w+", named[1]))
+    assert settings >= {"autostart", "model", "covariance_mode"}
+    known = {field.name for field in dataclasses.fields(NodeConfig)}
+    assert settings <= known
+
+
+def test_launch_uses_every_argument_and_no_other() -> None:
+    path = LAUNCH / "cello3d.launch.py"
+    used = set(re.findall(r'given\["(\w+)"\]', path.read_text())) | {"model", "covariance_mode"}
+    assert used == set(constant(path, "ARGUMENTS"))
+
+
+def test_the_demo_passes_on_arguments_that_are_there() -> None:
+    assert set(constant(LAUNCH / "demo.launch.py", "ARGUMENTS")) <= set(
+        constant(LAUNCH / "cello3d.launch.py", "ARGUMENTS")
+    )
+    assert (ROOT / constant(LAUNCH / "demo.launch.py", "ARGUMENTS")["bag"][0]).is_dir()
+
+
+def test_files_named_by_launch_are_installed() -> None:
+    text = (LAUNCH / "cello3d.launch.py").read_text()
+    for folder, name in re.findall(r'"(config|rviz)", "([\w.]+)"', text):
+        assert (ROOT / folder / name).is_file()
+
+
 def test_rviz_shows_the_topics_of_the_node() -> None:
     view = yaml.safe_load((ROOT / "rviz" / "cello3d.rviz").read_text())
     manager = view["Visualization Manager"]
     topics = {d["Topic"]["Value"] for d in manager["Displays"] if "Topic" in d}
-    assert topics == {"/covariance_node/pose", "/odom", "/points"}
+    inputs = {"/odom", "/points"}
+    assert topics == inputs | {OURS + name for name in ("pose", "odometry", "markers")}
     assert manager["Global Options"]["Fixed Frame"] == "odom"
+    markers = next(d for d in manager["Displays"] if d["Class"].endswith("/MarkerArray"))
+    assert set(markers["Namespaces"]) == {"translation", "rotation", "weakest", "chain"}
+
+
+def test_foxglove_shows_the_topics_of_the_node() -> None:
+    text = (ROOT / "config" / "foxglove_layout.json").read_text()
+    layout = json.loads(text)
+    panels = layout["configById"]
+    leaves = re.findall(r'"([\w ]+![\w]+)"', json.dumps(layout["layout"]))
+    assert sorted(leaves) == sorted(panels)
+    topics = {topic.split(".")[0] for topic in re.findall(r'"(/[\w/.]+)', text)}
+    outputs = ("relative_pose", "pose", "odometry", "markers")
+    assert topics == {"/odom", "/points", "/diagnostics", *(OURS + name for name in outputs)}
+    status = panels["DiagnosticStatusPanel!cello3d"]
+    assert status["selectedName"] == "covariance_node: registration"
+
+
+def test_all_files_of_config_are_installed() -> None:
+    patterns = re.findall(r'glob\("(config/[^"]+)"\)', (ROOT / "setup.py").read_text())
+    installed = {path for pattern in patterns for path in ROOT.glob(pattern)}
+    assert installed == {path for path in (ROOT / "config").rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.name)
+def test_the_examples_configure_the_node(path) -> None:
+    tree = yaml.safe_load(path.read_text())
+    config = config_from(tree["covariance_node"]["ros__parameters"], str(path))
+    assert config != Config()
+    for node in tree.values():
+        assert list(node) == ["ros__parameters"]
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.name)
+def test_the_examples_hear_topics_of_the_node(path) -> None:
+    text = path.read_text()
+    named = set(re.findall(r"/covariance_node/(\w+)", text))
+    assert named <= {"odometry", "pose", "relative_pose"}
+    for program in ("robot_localization", "fuse"):
+        if path.stem == program:
+            assert named == {"odometry"}
+
+
+def test_robot_localization_fuses_velocities_only() -> None:
+    """The state is x y z, roll pitch yaw, their velocities, three accelerations."""
+    tree = yaml.safe_load((ROOT / "config/examples/robot_localization.yaml").read_text())
+    ekf = tree["ekf_filter_node"]["ros__parameters"]
+    assert ekf["odom0_config"] == [False] * 6 + [True] * 6 + [False] * 3
+    assert not ekf["odom0_differential"]
+
+
+def test_fuse_takes_each_message_as_a_step() -> None:
+    tree = yaml.safe_load((ROOT / "config/examples/fuse.yaml").read_text())
+    lidar = tree["state_estimator"]["ros__parameters"]["lidar"]
+    assert lidar["differential"] is True
+    assert lidar["independent"] is False
+    assert lidar["use_twist_covariance"] is True
 
 
 def test_the_dds_profile_has_shared_memory_for_a_million_points() -> None:

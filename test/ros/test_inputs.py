@@ -84,6 +84,28 @@ def ended_well(node: NodeProcess) -> None:
     assert "Traceback" not in node.output()
 
 
+def connect(player: replay.Player, pose: Callable[[int], None] | None = None) -> None:
+    """Wait until the node hears clouds and, if there are some, poses, and is heard.
+
+    pose: publishes one with a stamp.
+    """
+    stamp_ns = T0 - 10 * STEP_NS
+
+    def connected() -> bool:
+        nonlocal stamp_ns
+        stamp_ns = min(stamp_ns + STEP_NS // 100, T0 - 1)
+        player.publish_cloud(stamp_ns, np.empty((0, 3)))
+        if pose is not None:
+            pose(stamp_ns)
+        status = player.replay.last_status
+        heard = int(status.get("received", 0)) > 0 and (
+            pose is None or int(status["odometry_received"]) > 0
+        )
+        return heard and all(s.get_publisher_count() for s in player._subscriptions)
+
+    assert player.spin_until(connected, 60.0)
+
+
 def send(player: replay.Player, scan: Scan, odometry: bool = True) -> dict[str, str]:
     """Send one scan, with its odometry or without; return its fate."""
     if odometry:
@@ -136,18 +158,17 @@ def test_external_takes_one_parameter_and_one_remapping(start, constant_Y) -> No
 def test_an_external_pose_belongs_to_the_cloud_of_its_stamp(start) -> None:
     player = start(registration="external")
     poses = player._node.create_publisher(PoseWithCovarianceStamped, "/external_pose", 10)
-    assert player.spin_until(
-        lambda: poses.get_subscription_count() and player.clouds.get_subscription_count(), 60.0
-    )
+
+    def publish(stamp_ns: int, T: np.ndarray = START) -> None:
+        poses.publish(messages.pose_with_covariance(stamp_ns, "map", T, np.zeros((6, 6))))
+
+    connect(player, publish)
     fates = []
     for scan in walk(4):
         late_ns = STEP_NS // 2 if len(fates) == 2 else 0
-        message = messages.pose_with_covariance(
-            scan.stamp_ns + late_ns, "map", scan.T_odom_sensor, np.zeros((6, 6))
-        )
         player.publish_cloud(scan.stamp_ns, scan.points)
         player.spin_for(0.05)  # the other program takes its time
-        poses.publish(message)
+        publish(scan.stamp_ns + late_ns, scan.T_odom_sensor)
         fates.append(settled(player, scan.stamp_ns))
     assert [fate["last_event"] for fate in fates] == [
         *("reference", "answered", "no_external_pose", "answered")
@@ -260,13 +281,7 @@ def test_without_odometry_the_policy_decides(start, policy) -> None:
 
 def test_no_odometry_at_all(start) -> None:
     player = start(guess_without_odometry="constant_velocity", odometry_timeout_s=0.0)
-    assert player.spin_until(
-        lambda: (
-            player.clouds.get_subscription_count()
-            and all(s.get_publisher_count() for s in player._subscriptions)
-        ),
-        60.0,
-    )
+    connect(player)
     scans = walk(5)
     fates = [send(player, scan, odometry=False) for scan in scans]
     assert [fate["last_event"] for fate in fates] == ["reference"] + 4 * ["answered"]
@@ -335,5 +350,5 @@ def test_tf_without_its_messages_is_refused_by_name(tmp_path, domain_id, model_p
     parameters = {"node.model": model_path, "node.use_tf": "true"}
     with NodeProcess(tmp_path / "log", domain_id, parameters) as node:
         assert node.wait(60.0) == 1
-        assert "parameter node.use_tf needs the package tf2_msgs" in node.output()
+        assert "parameter node.use_tf needs tf2_msgs" in node.output()
         assert "Traceback" not in node.output()
