@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from sensor_msgs.msg import PointCloud2
 
 from cello3d_ros.config import NodeConfig
-from cello3d_ros.ros.messages import tf_message_type
+from cello3d_ros.ros.messages import tf_message
 
 
 class Role(Enum):
@@ -41,7 +41,7 @@ def topics(config: NodeConfig) -> list[Topic]:
     """
     found = []
     if config.use_tf:
-        kind = tf_message_type("node.use_tf")
+        kind = tf_message("node.use_tf")
         found += [
             Topic(Role.STATIC_TRANSFORMS, kind, "/tf_static", _latched(100)),
             Topic(Role.TRANSFORMS, kind, "/tf", QoSProfile(depth=100)),

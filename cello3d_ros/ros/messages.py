@@ -130,21 +130,21 @@ def transform_to(stamp_ns: int, frame_id: str, child_frame_id: str, T: Array) ->
     return message
 
 
+def tf_message(parameter: str) -> Any:
+    """Return tf2_msgs/TFMessage, which only some parameters need.  Raises ConfigError."""
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:
+        raise ConfigError(
+            f"parameter {parameter} needs the package tf2_msgs: apt install ros-jazzy-tf2-msgs, "
+            "or leave it false"
+        ) from None
+    return TFMessage
+
+
 def _cells(covariance: Array) -> Array:
     """Return 36 finite doubles, row by row."""
     cells = np.ascontiguousarray(covariance, dtype=np.float64).reshape(36)
     if not np.isfinite(cells).all():
         raise CovarianceError("the covariance is not finite")
     return cells
-
-
-def tf_message_type(parameter: str) -> Any:
-    """Return tf2_msgs/TFMessage, which only some settings need.  Raises ConfigError without it."""
-    try:
-        from tf2_msgs.msg import TFMessage
-    except ImportError:
-        raise ConfigError(
-            f"parameter {parameter} needs tf2_msgs, which is not installed: "
-            "apt install ros-jazzy-tf2-msgs, or leave it false"
-        ) from None
-    return TFMessage

@@ -39,11 +39,13 @@ from cello3d_ros.ros.inputs import Role, Topic, topics
 from cello3d_ros.ros.intake import JUMP_NS, Job, Skip
 from cello3d_ros.ros.life import ManagedNode
 from cello3d_ros.ros.logbook import Logbook
+from cello3d_ros.ros.messages import tf_message
 from cello3d_ros.ros.outputs import Outputs
 from cello3d_ros.ros.tracker import Answer, reason_of
 from cello3d_ros.ros.warmup import warm_up
 from cello3d_ros.ros.worker import Worker
 
+_MAX_POSTPONED = 200  # messages heard before work is done all the same
 _TICK_S = 0.05  # how often it is looked whether a cloud has waited too long
 
 
@@ -72,6 +74,8 @@ class CovarianceNode(ManagedNode):
         self._model = load_model(path)
         config = self._declared(self._model)
         topics(config.node)  # what is not installed is better missed before the warming up
+        if config.node.publish_tf:
+            tf_message("node.publish_tf")
         self.get_logger().info("warming up; a first start compiles the kernels")
         warm_up(self._model, config)
         self._statistics = Statistics(path.name)
@@ -94,8 +98,8 @@ class CovarianceNode(ManagedNode):
         self._statistics.listen(True)
         self.active.callback(self._statistics.listen, False)
         self.active.callback(self._worker.stop)
-        # a guard runs after the subscriptions, so that the newest cloud is there when work starts
-        self._work_is_there = self.create_guard_condition(self._work)
+        self._n_postponed, self._is_news = 0, False
+        self._work_is_there = self.create_guard_condition(self._work_when_quiet)
         self.active.callback(self.destroy_guard_condition, self._work_is_there)
         timer = self.create_timer(_TICK_S, self._expire, clock=self._steady)
         self.active.callback(self.destroy_timer, timer)
@@ -139,6 +143,7 @@ class CovarianceNode(ManagedNode):
     # what is heard
 
     def _on_pose(self, message: Odometry | PoseWithCovarianceStamped) -> None:
+        self._is_news = True
         self._statistics.counts["odometry"] += 1
         if not self._worker.hear_pose(message, self._now_ns()):
             self._statistics.counts["odometry_rejected"] += 1
@@ -157,6 +162,7 @@ class CovarianceNode(ManagedNode):
         self._worker.hear_reference(message)
 
     def _on_cloud(self, message: PointCloud2) -> None:
+        self._is_news = True
         self._statistics.receive()
         self._worker.hear_cloud(message, self._now_ns())
         if self._worker.has_work:
@@ -177,6 +183,19 @@ class CovarianceNode(ManagedNode):
         return response
 
     # what is said
+
+    def _work_when_quiet(self) -> None:
+        """Work, but first hear what came meanwhile: an older cloud must not win over the newest.
+
+        A guard runs after the subscriptions, of which each hands over one message at a time.
+        """
+        if self._is_news and self._n_postponed < _MAX_POSTPONED:
+            self._is_news = False
+            self._n_postponed += 1
+            self._work_is_there.trigger()
+            return
+        self._n_postponed = 0
+        self._work()
 
     def _work(self) -> None:
         job = self._worker.take()

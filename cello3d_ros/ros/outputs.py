@@ -25,9 +25,7 @@ class Outputs:
         """Announce the topics.  Raises ConfigError when TF is asked for and not there."""
         self._node = node
         self._n_answers = 0
-        self._tf_message = (
-            messages.tf_message_type("node.publish_tf") if config.publish_tf else None
-        )
+        self._tf_message = messages.tf_message("node.publish_tf") if config.publish_tf else None
         self._relative = node.create_publisher(PoseWithCovarianceStamped, "~/relative_pose", 10)
         self._pose = node.create_publisher(PoseWithCovarianceStamped, "~/pose", 10)
         self._odometry = node.create_publisher(Odometry, "~/odometry", 10)

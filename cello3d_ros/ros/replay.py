@@ -101,6 +101,7 @@ class Player:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._check = check
+        self._status_name = f"{target.rsplit('/', 1)[-1]}: "
         self.replay = Replay()
         # the target hears of the publishers in this order: who hears odometry also hears clouds
         self.clouds = self._node.create_publisher(PointCloud2, "/points", 5)
@@ -191,7 +192,7 @@ class Player:
     def _note_status(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {item.key: item.value for item in status.values}
-            if "last_stamp_ns" in values:
+            if status.name.startswith(self._status_name) and "last_stamp_ns" in values:
                 values["level"], values["message"] = str(status.level[0]), status.message
                 self.replay.status[int(values["last_stamp_ns"])] = values
                 self.replay.last_status = values

@@ -168,12 +168,14 @@ def lone_robot(player: Any) -> Robot:
 def ask(player: Any) -> Callable[..., Any]:
     """Call a service of the node."""
 
+    clients: dict[str, Any] = {}
+
     def call(kind: Any, name: str, request: Any) -> Any:
-        client = player._node.create_client(kind, f"/covariance_node/{name}")
-        assert player.spin_until(client.service_is_ready, 60.0)
-        future = client.call_async(request)
+        if name not in clients:
+            clients[name] = player._node.create_client(kind, f"/covariance_node/{name}")
+            assert player.spin_until(clients[name].service_is_ready, 60.0)
+        future = clients[name].call_async(request)
         assert player.spin_until(future.done, 180.0)
-        player._node.destroy_client(client)
         return future.result()
 
     return call

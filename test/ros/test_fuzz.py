@@ -1,15 +1,29 @@
-"""Damaged bytes of clouds and odometry: the node outlives them and is right on the next scans."""
+"""Thousands of damaged clouds and odometry messages: the node outlives them, flat in memory, and
+every good scan between them is answered, and rightly."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
 
+from lifecycle_msgs.srv import GetState
 from rclpy.serialization import serialize_message
 
+from cello3d_ros.geometry import se3
+from cello3d_ros.recordings import open_recording
 from cello3d_ros.ros import messages
 
-N_BATCHES, N_BYTES = 25, 4
+from .conftest import Robot
+
+N_DAMAGED, N_BATCH = 5000, 100
+N_GOOD = 4  # one more than the failures after which a reference is given up
+STEP_NS = 500_000_000
+N_BYTES = 4
+BAG = Path(__file__).parents[2] / "bags" / "demo"
 
 
 def damaged(raw: bytes, rng: np.random.Generator, n_header: int) -> bytes:
@@ -23,14 +37,90 @@ def damaged(raw: bytes, rng: np.random.Generator, n_header: int) -> bytes:
     return bytes(data)
 
 
-def test_the_node_outlives_damaged_messages(robot, node) -> None:
+def memory_mb(pid: int) -> float:
+    """Resident memory of a process."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(s.split()[1]) for s in lines if s.startswith("VmRSS:")) / 1024
+
+
+class Walker(Robot):
+    """Walks to and fro along a recording, with exact odometry."""
+
+    def __init__(self, player: Any) -> None:
+        super().__init__(player)
+        self.scans = [(scan.T_world_sensor, scan.points[::4]) for scan in open_recording(BAG)]
+        self.poses: dict[int, np.ndarray] = {}
+
+    def scan(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the robot is and what it sees."""
+        n = self.n % (2 * len(self.scans) - 2)
+        return self.scans[min(n, 2 * len(self.scans) - 2 - n)]
+
+    def pose(self) -> np.ndarray:
+        return self.scan()[0]
+
+    def points(self) -> np.ndarray:
+        return self.scan()[1]
+
+    def good(self) -> str:
+        """Take a good step, half a second long, and return what became of it."""
+        self.step(STEP_NS)
+        self.poses[self.stamp_ns] = self.pose()
+        return self.send(self.points())["last_event"]
+
+    def assert_right(self) -> None:
+        """The last step was answered with the pose that it has in its reference."""
+        status = self.player.replay.status[self.stamp_ns]
+        assert status["last_event"] == "answered"
+        T_true = se3.inverse(self.poses[int(status["reference_stamp_ns"])]) @ self.pose()
+        T = self.player.replay.relative[self.stamp_ns].T
+        assert np.abs(se3.log(se3.inverse(T_true) @ T)).max() < 0.1
+
+    def wait(self, ask: Callable[..., Any]) -> None:
+        """Let the node hear what was sent: one message of a topic and one request at a time."""
+        ask(GetState, "get_state", GetState.Request())
+
+
+@pytest.fixture(scope="module")
+def walker(lone_robot) -> Walker:
+    return Walker(lone_robot.player)
+
+
+def test_thousands_of_damaged_clouds(walker, node, ask) -> None:
     rng = np.random.default_rng(11)
-    for _ in range(N_BATCHES):
-        robot.step()
-        cloud = messages.cloud_to(robot.stamp_ns, "lidar", robot.points())
-        odometry = messages.odometry_to(robot.stamp_ns, "odom", "lidar", robot.pose())
-        robot.player.odometry.publish(damaged(serialize_message(odometry), rng, 120))
-        robot.player.clouds.publish(damaged(serialize_message(cloud), rng, 160))
-        robot.walk(2)  # a damaged stamp may have reset the clock: the second has a reference
-        robot.assert_right_again()
-    node.check()
+    walker.good()
+    n_before, memory_before_mb = _count(walker, "received"), memory_mb(node.pid)
+    for _ in range(N_DAMAGED // N_BATCH):
+        for i in range(N_BATCH):
+            walker.stamp_ns += 1_000_000
+            cloud = messages.cloud_to(walker.stamp_ns, "lidar", walker.points())
+            walker.player.publish_odometry(walker.stamp_ns, walker.pose())
+            walker.player.clouds.publish(damaged(serialize_message(cloud), rng, 160))
+            if i % 2:
+                walker.wait(ask)
+        for _ in range(N_GOOD):  # a scrambled cloud may have become the reference
+            walker.good()
+        walker.assert_right()
+    assert _count(walker, "received") - n_before > 0.5 * N_DAMAGED  # ROS itself refuses the rest
+    assert memory_mb(node.pid) - memory_before_mb < 30.0
+
+
+def test_thousands_of_damaged_odometry_messages(walker, node, ask) -> None:
+    rng = np.random.default_rng(12)
+    walker.good()
+    n_before, memory_before_mb = _count(walker, "odometry_received"), memory_mb(node.pid)
+    for _ in range(N_DAMAGED // N_BATCH):
+        for _ in range(N_BATCH):
+            walker.stamp_ns += 1_000_000
+            odometry = messages.odometry_to(walker.stamp_ns, "odom", "lidar", walker.pose())
+            walker.player.odometry.publish(damaged(serialize_message(odometry), rng, 120))
+            walker.wait(ask)
+        for _ in range(N_GOOD):  # some lie unseen, with stamps up to a second ahead
+            walker.good()
+        walker.assert_right()
+    assert _count(walker, "odometry_received") - n_before > 0.5 * N_DAMAGED
+    assert memory_mb(node.pid) - memory_before_mb < 30.0
+
+
+def _count(walker: Walker, key: str) -> int:
+    return int(walker.player.replay.last_status[key])

@@ -350,5 +350,5 @@ def test_tf_without_its_messages_is_refused_by_name(tmp_path, domain_id, model_p
     parameters = {"node.model": model_path, "node.use_tf": "true"}
     with NodeProcess(tmp_path / "log", domain_id, parameters) as node:
         assert node.wait(60.0) == 1
-        assert "parameter node.use_tf needs tf2_msgs" in node.output()
+        assert "parameter node.use_tf needs the package tf2_msgs" in node.output()
         assert "Traceback" not in node.output()

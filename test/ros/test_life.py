@@ -1,5 +1,6 @@
 """The node as a lifecycle node: states, what is heard in each, what fails and why."""
 
+import shutil
 from collections.abc import Iterator
 
 import pytest
@@ -42,11 +43,15 @@ def go(ask):
     return call
 
 
-def test_a_whole_life(go, ask, change, node, player: Player, model_path, request) -> None:
+def test_a_whole_life(
+    go, ask, change, node, player: Player, model_path, request, tmp_path
+) -> None:
+    model = tmp_path / "model.npz"
+    shutil.copy(model_path, model)
     assert go(Transition.TRANSITION_ACTIVATE) == (False, UNCONFIGURED)
     assert go(Transition.TRANSITION_CONFIGURE) == (False, UNCONFIGURED)
     assert "cannot read /no/model.npz" in node.output()
-    assert change("node.model", str(model_path)).successful
+    assert change("node.model", str(model)).successful
     assert go(Transition.TRANSITION_CONFIGURE) == (True, INACTIVE)
     heard = player.replay
     assert player.spin_until(lambda: heard.last_status.get("last_event") == "inactive", 10.0)
@@ -66,8 +71,16 @@ def test_a_whole_life(go, ask, change, node, player: Player, model_path, request
     assert robot.walk()["last_event"] == "reference"
     robot.assert_right_again()
 
+    whole = model.read_bytes()
+    model.write_bytes(whole[:1000])  # replaced on disk, in place, while it is used
+    robot.walk(3)
+    robot.assert_right_again()
+
     assert go(Transition.TRANSITION_DEACTIVATE) == (True, INACTIVE)
     assert go(Transition.TRANSITION_CLEANUP) == (True, UNCONFIGURED)
+    assert go(Transition.TRANSITION_CONFIGURE) == (False, UNCONFIGURED)
+    assert f"{model} is truncated or damaged" in node.output()
+    model.write_bytes(whole)
     assert change("cloud.voxel_m", 0.25).successful
     assert go(Transition.TRANSITION_CONFIGURE) == (True, INACTIVE)
     assert "not as the model was trained: cloud.voxel_m is 0.25, not 0.2" in node.output()

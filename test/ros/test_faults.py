@@ -1,0 +1,207 @@
+"""What goes wrong around a node: time, publishers, the node itself, parameters, the scene."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+
+from cello3d_ros.ros.process import NodeProcess
+from cello3d_ros.ros.replay import Player
+
+from .conftest import STEP_NS, Robot
+
+S = 10**9
+
+
+def test_a_bag_that_is_played_in_a_loop(robot) -> None:
+    robot.walk()
+    start_ns, restarts = robot.stamp_ns, []
+    for _ in range(3):
+        robot.stamp_ns, heard = start_ns - 100 * S, robot.player.replay
+        for of_last_time in (heard.status, heard.relative, heard.poses):
+            of_last_time.clear()
+        fates = [robot.walk() for _ in range(12)]
+        assert [fate["last_event"] for fate in fates] == ["reference", *["answered"] * 11]
+        restarts.append(int(fates[-1]["chain_restarts"]))
+    assert np.diff(restarts).tolist() == [1, 1]
+    robot.stamp_ns = start_ns + S
+
+
+def test_parameters_that_change_under_load(robot, change, ask) -> None:
+    """Clouds come as fast as they can be sent while settings go to and fro."""
+    player, verdicts = robot.player, []
+    change("icp.trim_ratio", 0.7)  # the service is known
+    client = player._node.create_client(SetParameters, "/covariance_node/set_parameters")
+    assert player.spin_until(client.service_is_ready, 20.0)
+    for i in range(60):
+        robot.step()
+        player.publish_odometry(robot.stamp_ns, robot.pose())
+        player.publish_cloud(robot.stamp_ns, robot.points())
+        given = [
+            Parameter("icp.trim_ratio", value=0.6 + 0.2 * (i % 2)),
+            Parameter("node.ceiling", value=[900.0, 1e-6, 2e3][i % 3]),  # the last is refused
+        ]
+        request = SetParameters.Request(parameters=[p.to_parameter_msg() for p in given])
+        verdicts.append(client.call_async(request))
+        player.spin_for(0.001)
+    assert player.spin_until(lambda: all(v.done() for v in verdicts), 20.0)
+    robot.settled()
+    player._node.destroy_client(client)
+    taken = [[result.successful for result in v.result().results] for v in verdicts]
+    assert taken == [[True, i % 3 != 2] for i in range(60)]
+    assert change("icp.trim_ratio", 0.7).successful
+    assert change("node.ceiling", 900.0).successful
+    robot.assert_right_again()
+
+
+def test_the_newest_cloud_is_next_when_many_came_during_long_work(robot) -> None:
+    """Each with its odometry, which waits in a queue of its own."""
+    player = robot.player
+    stamps = []
+    for n_points in (800_000, *[4000] * 9):
+        robot.step()
+        stamps.append(robot.stamp_ns)
+        player.publish_odometry(robot.stamp_ns, robot.pose())
+        player.publish_cloud(robot.stamp_ns, robot.points(n_points))
+    assert robot.settled()["last_event"] == "answered"
+    assert [ns for ns in stamps[1:] if ns in player.replay.relative] == stamps[-1:]
+    robot.assert_right_again()
+
+
+PUBLISHER = """
+import sys
+from cello3d_ros.ros.replay import Player
+from conftest import Robot
+robot = Robot(Player(int(sys.argv[1])))
+robot.stamp_ns = int(sys.argv[2])
+robot.player.connect(robot.stamp_ns, robot.pose(), 60.0)
+while True:
+    robot.walk()
+    print(robot.n, flush=True)
+"""
+
+
+def test_a_publisher_that_is_killed_and_comes_back(robot, node, domain_id) -> None:
+    for _ in range(2):
+        robot.step(S)
+        command = [sys.executable, "-c", PUBLISHER, str(domain_id), str(robot.stamp_ns)]
+        path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+        other = subprocess.Popen(
+            command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path}
+        )
+        try:
+            assert other.stdout is not None
+            assert [int(other.stdout.readline()) for _ in range(5)] == [1, 2, 3, 4, 5]
+        finally:
+            other.kill()
+            other.wait()
+        robot.stamp_ns += 1000 * STEP_NS
+    robot.walk(2)
+    robot.assert_right_again()
+
+
+def test_a_node_that_is_killed_and_comes_back(tmp_path, domain_id, model_path) -> None:
+    name = "mortal_node"
+    player = Player(domain_id, f"/{name}")
+    robot = Robot(player)
+    try:
+        for i in range(2):
+            with _named(name, tmp_path / str(i), domain_id, model_path) as process:
+                _connect(robot, process)
+                assert robot.walk(2)["chain_restarts"] == "0"
+                robot.assert_right_again()
+                if i == 0:
+                    process.send(signal.SIGKILL)
+                    assert process.wait() == -signal.SIGKILL
+                else:
+                    assert process.stop() == 0
+            player.replay.last_status.clear()
+            robot.step(S)
+    finally:
+        player.close()
+
+
+def test_two_nodes_side_by_side(tmp_path, domain_id, model_path) -> None:
+    names = ["left_node", "right_node"]
+    players = [Player(domain_id, f"/{name}") for name in names]
+    robots = [Robot(player) for player in players]
+    try:
+        with (
+            _named(names[0], tmp_path / "0", domain_id, model_path) as left,
+            _named(names[1], tmp_path / "1", domain_id, model_path) as right,
+        ):
+            for robot, process in zip(robots, (left, right)):
+                _connect(robot, process)
+            for _ in range(4):  # both hear the first robot
+                robots[0].walk()
+                robots[1].stamp_ns, robots[1].n = robots[0].stamp_ns, robots[0].n
+                robots[1].settled()
+            robots[0].assert_right_again()
+            robots[1].stamp_ns, robots[1].n = robots[0].stamp_ns, robots[0].n
+            assert robots[1].settled()["last_event"] == "answered"
+            stamp_ns = robots[0].stamp_ns
+            a, b = (player.replay.relative[stamp_ns] for player in players)
+            np.testing.assert_allclose(a.T, b.T, atol=0.02)
+            assert left.stop() == right.stop() == 0
+    finally:
+        for player in players:
+            player.close()
+
+
+def _named(name: str, log, domain_id: int, model_path) -> NodeProcess:
+    parameters = {"node.model": model_path}
+    return NodeProcess(log, domain_id, parameters, ["-r", f"__node:={name}"])
+
+
+def _connect(robot: Robot, process: NodeProcess) -> None:
+    robot.player._check = process.check
+    robot.player.connect(robot.stamp_ns, robot.pose(), 60.0)
+
+
+def corridor(rng: np.random.Generator, x: float) -> np.ndarray:
+    """Floor and walls of a corridor without ends, seen from ``x`` along it: (N, 3)."""
+    u = rng.uniform([-15.0, -1.0], [15.0, 1.0], (6000, 2))
+    floor = np.column_stack([u[:2000, 0], 1.2 * u[:2000, 1], np.full(2000, -1.0)])
+    wall = np.column_stack([u[2000:, 0], np.full(4000, 1.2), 1.4 * u[2000:, 1] + 0.4])
+    wall[::2, 1] *= -1.0
+    return np.vstack([floor, wall])
+
+
+def test_a_scene_that_degenerates_and_recovers(tmp_path, domain_id) -> None:
+    """In a corridor without ends the uncertainty along it is large and said to be so."""
+    player = Player(domain_id, "/shipped_node")
+    robot, rng = Robot(player), np.random.default_rng(5)
+    log, arguments = tmp_path / "log", ["-r", "__node:=shipped_node"]
+    try:
+        with NodeProcess(log, domain_id, {}, arguments) as process:
+            _connect(robot, process)
+            at_home = _weakest(robot, robot.points)
+            inside = _weakest(robot, lambda: corridor(rng, 0.0))
+            again = _weakest(robot, robot.points)
+            assert process.stop() == 0
+    finally:
+        player.close()
+    assert abs(inside[1][0]) > 0.99
+    assert inside[0] > 5.0 * at_home[0]
+    assert again[0] < 2.0 * at_home[0]
+    robot.assert_sane()
+
+
+def _weakest(robot: Robot, points: Callable[[], np.ndarray]) -> tuple[float, list[float]]:
+    """Walk on into the new scene; return the largest sigma and its direction."""
+    for _ in range(5):  # the old reference is given up after three failures
+        robot.step()
+        status = robot.send(points())
+    assert status["last_event"] == "answered"
+    direction = [float(word) for word in status["weakest_direction"].split()]
+    return float(status["weakest_sigma_m"]), direction
