@@ -87,11 +87,6 @@ class Tracker:
         self._motion = Motion()
         self._T_map_odom: Array = _ORIGIN
 
-    @property
-    def map_stamp_ns(self) -> int | None:
-        """Stamp of the reference cloud that came last, or None."""
-        return None if self._map is None else self._map.stamp_ns
-
     def reset(self, reason: str = "") -> None:
         """Forget the reference and the chain; the next scan starts anew.  A map stays."""
         if self._reference is not None:
@@ -103,10 +98,16 @@ class Tracker:
         self.n_failures = 0
 
     def take_map(self, stamp_ns: int, points: Array, frame_id: str) -> None:
-        """Register scans to this cloud from now on.  points: (N, 3), in the frame ``frame_id``."""
+        """Register scans to this cloud from now on.  points: (N, 3), in the frame ``frame_id``.
+
+        One that comes again, as it does by two subscriptions, is not prepared again.
+        """
+        new = Map(stamp_ns, points, frame_id)
         if self._map is None or self._map.frame_id != frame_id:
             self.reset("the frame of the reference cloud changed")
-        self._map = Map(stamp_ns, points, frame_id)
+        elif self._map.is_same(new):
+            return
+        self._map = new
 
     def step(self, stamp_ns: int, points: Array, place: Place) -> Answer | None:
         """Register a scan to the reference; it becomes the reference, or not, by ``pairing``.

@@ -102,10 +102,8 @@ class Worker:
                 self._warn("transform", sentence)
 
     def hear_reference(self, message: PointCloud2) -> None:
-        """Register to this cloud from now on; one that comes twice is the same one."""
+        """Register to this cloud from now on."""
         stamp_ns, frame_id = messages.stamp_ns_of(message), message.header.frame_id
-        if self._tracker.map_stamp_ns == stamp_ns and self._locator.map_frame == frame_id:
-            return
         try:
             points = read_points(message)
             if not frame_id or not len(points):

@@ -12,6 +12,7 @@ from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import compound_right, is_positive_definite
 from cello3d_ros.registration.icp import Registration
 from cello3d_ros.ros import external as external_module
+from cello3d_ros.ros import pairing
 from cello3d_ros.ros import tracker as module
 from cello3d_ros.ros.covariances import CovarianceError
 from cello3d_ros.ros.external import DisagreementError
@@ -372,6 +373,17 @@ def test_a_scan_is_registered_to_the_map_in_the_frame_of_the_map(asked) -> None:
         np.testing.assert_allclose(answer.T_odom_read, T, atol=1e-9)
         np.testing.assert_allclose(answer.Y_chain, WIDE, atol=1e-12)  # of one registration
         assert (answer.reference_ns, answer.frame_id, answer.pose_frame_id) == (7, "map", "map")
+
+
+def test_a_map_that_comes_again_is_prepared_once_and_a_new_one_anew(asked, monkeypatch) -> None:
+    prepared = []
+    around = pairing.prepare
+    monkeypatch.setattr(pairing, "prepare", lambda *a: prepared.append(1) or around(*a))
+    tracker = tracker_with(pairing="topics")
+    for i, points in enumerate((MAP, MAP.copy(), MAP + [0.1, 0.0, 0.0])):
+        tracker.take_map(0, points, "map")  # whose stamp says nothing
+        tracker.step(i * S, POINTS, Place(IN_MAP))
+    assert len(prepared) == 2
 
 
 def test_odometry_that_drifts_or_jumps_from_the_map_is_followed(asked) -> None:
