@@ -151,7 +151,7 @@ def in_process(scans: InMemory, parameters: dict[str, Any]) -> dict[str, Any]:
         node._worker.answer = alone.timing(node._worker.answer)  # type: ignore[method-assign]
 
         def answer(raw: bytes) -> None:
-            node._on_cloud(deserialize_message(raw, PointCloud2))
+            node._on_cloud(deserialize_message(raw, PointCloud2), {})
             node._work()
 
         for scan in scans:

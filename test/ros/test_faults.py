@@ -66,14 +66,19 @@ def test_parameters_that_change_under_load(robot, change, ask) -> None:
 
 def test_the_newest_cloud_is_next_when_many_came_during_long_work(robot) -> None:
     """Each with its odometry, which waits in a queue of its own."""
-    player = robot.player
+    player, before = robot.player, robot.walk()
     stamps = []
     for n_points in (800_000, *[4000] * 9):
         robot.step()
         stamps.append(robot.stamp_ns)
         player.publish_odometry(robot.stamp_ns, robot.pose())
         player.publish_cloud(robot.stamp_ns, robot.points(n_points))
-    assert robot.settled()["last_event"] == "answered"
+    after = robot.settled()
+    assert after["last_event"] == "answered"
+    counts = [int(after[key]) - int(before[key]) for key in ("received", "answered", "dropped")]
+    assert counts[0] == 10  # every cloud is accounted for
+    assert counts[0] == counts[1] + counts[2]
+    assert int(after["dropped.unheard"]) > int(before.get("dropped.unheard", 0))
     assert [ns for ns in stamps[1:] if ns in player.replay.relative] == stamps[-1:]
     robot.assert_right_again()
 
