@@ -22,6 +22,7 @@ import numpy as np
 import psutil
 
 from cello3d_ros.config import Pipeline, SamplingConfig
+from cello3d_ros.covariance.features import FEATURES
 from cello3d_ros.learning.cluster import Job, connected
 from cello3d_ros.learning.dataset import PairRecord
 from cello3d_ros.learning.sampling import Block
@@ -60,6 +61,7 @@ def seconds(client, n_tasks: int, n_samples: int, sleep_s: float) -> float:
         accepted=False,
         T_mean=np.eye(4),
         descriptors=np.zeros((4, 704), np.float32),
+        features=np.zeros(len(FEATURES)),
     )
     key = 0
 

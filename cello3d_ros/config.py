@@ -132,13 +132,21 @@ class TrainingConfig(Section):
         "what covariances are relative to; none is the paper",
         choices=("none", "hessian", "sandwich"),
     )
+    features: str = _setting(
+        "global",
+        "what Theta is learned over; descriptor is the paper's, global a few numbers of the pair",
+        choices=("descriptor", "global", "both"),
+    )
     theta: str = _setting(
-        "low_rank", "form of Theta", choices=("upper_triangular", "diagonal", "low_rank")
+        "diagonal", "form of Theta", choices=("upper_triangular", "diagonal", "low_rank")
     )
     rank: int = _setting(16, "rows of a low-rank Theta", 1, 10000)
     loss: str = _setting("log_det", "paper is the printed det F", choices=("log_det", "paper"))
     regularization: float = _setting(0.03, "lambda of lambda |Theta|^2", 0.0)
-    mean_weight: float = _setting(0.15, "share of the training mean in a prediction", 0.0, 1.0)
+    mean_weight: float = _setting(0.02, "share of the training mean in a prediction", 0.0, 1.0)
+    margin: float = _setting(
+        1.0, "factor on every predicted covariance, for what training data leave out", 1e-3, 1e3
+    )
     optimizer: str = _setting(
         "lbfgs", "what searches Theta; sgd is the paper's", choices=("lbfgs", "sgd")
     )

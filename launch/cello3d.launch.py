@@ -15,6 +15,8 @@ from launch import LaunchDescription
 ARGUMENTS = {
     "points": ("/points", "topic of the clouds (sensor_msgs/PointCloud2)"),
     "odom": ("/odom", "topic of the odometry (nav_msgs/Odometry)"),
+    "reference_points": ("/reference_points", "topic of a map, when node.pairing is topics"),
+    "external_odometry": ("/kiss/odometry", "poses to judge, when node.registration is external"),
     "model": ("", "model file; empty is the shipped one"),
     "params": ("", "parameter file of the node; empty is the model's settings and the defaults"),
     "covariance_mode": ("", "cello3d, fused, ...; empty is that of the parameter file"),
@@ -26,6 +28,7 @@ ARGUMENTS = {
     "bag": ("", "rosbag2 folder to play; empty plays none"),
     "bag_delay_s": ("8.0", "wait before the bag, so that the node is ready"),
 }
+TOPICS = ("points", "odom", "reference_points", "external_odometry")
 
 
 def actions(context):
@@ -43,10 +46,10 @@ def actions(context):
             package="cello3d_ros",
             executable="covariance_node",
             name=given["name"],
-            namespace=given["namespace"],
+            namespace=given["namespace"] or None,
             output="screen",
             parameters=parameters,
-            remappings=[("points", given["points"]), ("odom", given["odom"])],
+            remappings=[(name, given[name]) for name in TOPICS],
         )
     ]
     if _is_true(given["rviz"]):

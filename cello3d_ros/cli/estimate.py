@@ -23,7 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--init", metavar="FILE", help="first guess of T_ref_read: 16 or 12 numbers, row by row"
     )
-    parser.add_argument("--model", metavar="M", help="model file; the shipped one by default")
+    parser.add_argument(
+        "--model", metavar="M", default="general", help="model file, or a shipped model's name"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the random subsamples")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
@@ -32,10 +34,10 @@ def run(arguments: argparse.Namespace) -> None:
     """Print the pose and the covariance of one pair."""
     from cello3d_ros.clouds.shape import Cloud, prepare
     from cello3d_ros.covariance.estimator import estimate
-    from cello3d_ros.covariance.model import load_model, shipped_model_path
+    from cello3d_ros.covariance.model import find_model, load_model
     from cello3d_ros.recordings.files import read_cloud
 
-    model = load_model(arguments.model or shipped_model_path())
+    model = load_model(find_model(arguments.model))
     T_init = _read_pose(Path(arguments.init)) if arguments.init else np.eye(4)
     rng = np.random.default_rng(arguments.seed)
 

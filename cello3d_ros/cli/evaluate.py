@@ -61,7 +61,9 @@ _POSES = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
     parser.add_argument("datasets", nargs="+", type=Path, metavar="DATASET", help="folder")
-    parser.add_argument("--model", metavar="M", help="model file; the shipped one by default")
+    parser.add_argument(
+        "--model", metavar="M", default="general", help="model file, or a shipped model's name"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="all figures, to write")
     parser.add_argument("--seed", type=int, default=0, help="of every random draw")
     _words(parser, "--only", "PATTERN", "recordings to evaluate, such as '*_s11'; all by default")
@@ -74,8 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         "--baseline",
         "DATASET",
-        "folders with the model's training recordings, whose mean covariance is the baseline; "
-        "DATASET by default",
+        "folders whose mean covariance is the baseline, in place of the one that the model was "
+        "trained on",
     )
     _words(
         parser,
@@ -106,8 +108,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print tables and write the JSON."""
     from cello3d_ros.covariance.methods import MethodSettings
-    from cello3d_ros.covariance.model import load_model, shipped_model_path
-    from cello3d_ros.learning.comparison import from_dataset, training_mean
+    from cello3d_ros.covariance.model import find_model, load_model
+    from cello3d_ros.learning.comparison import from_dataset, mean_of, training_mean
     from cello3d_ros.learning.dataset import open_dataset
     from cello3d_ros.learning.examples import load_examples
 
@@ -118,13 +120,13 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         _check_writable(arguments.json)
     settings = MethodSettings(arguments.sensor_sigma, arguments.registrations)
-    path = arguments.model or shipped_model_path()
+    path = find_model(arguments.model)
     model = load_model(path)
     datasets = [open_dataset(folder) for folder in dict.fromkeys(arguments.datasets)]
     names = chosen(datasets, arguments.only, model, arguments.allow_seen)
     recordings = _recordings(arguments.recordings, names)
-    baseline = [open_dataset(folder) for folder in arguments.baseline] or datasets
-    mean = training_mean(model, baseline)
+    baseline = [open_dataset(folder) for folder in arguments.baseline]
+    mean = mean_of(baseline) if baseline else training_mean(model)
     examples = load_examples(datasets, names)
     keys = _accepted(datasets, names)
     predictions = from_dataset(model, examples, mean, settings)

@@ -44,7 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--variance", type=float, metavar="A", help="of the starts (m^2, rad^2)")
     parser.add_argument(
-        "--noise", type=float, metavar="SIGMA", help="range noise added at each registration, m"
+        "--noise",
+        type=float,
+        metavar="SIGMA",
+        help="standard deviation of ranges at each registration, m: of noise added to recorded "
+        "clouds, or of new scans where the recording was made by cello3d simulate",
     )
     parser.add_argument("--seed", type=int, help="seed of every random draw")
     parser.add_argument("--max-gap", type=int, metavar="G", help="largest j - i of a pair")
@@ -68,11 +72,14 @@ def run(arguments: argparse.Namespace) -> None:
     from cello3d_ros.learning.dataset import open_dataset
     from cello3d_ros.learning.identity import fingerprint
     from cello3d_ros.recordings import open_recording
+    from cello3d_ros.recordings.rescan import rescannable
+    from cello3d_ros.recordings.simulation import Simulation
 
     config = load_config(arguments.config) if arguments.config else Config()
     sampling = _sampling(config, arguments)
     pipeline = pipeline_of(config)
-    recordings = [open_recording(Path(path)) for path in arguments.recordings]
+    opened = rescannable if sampling.noise_m > 0.0 else open_recording
+    recordings = [opened(Path(path)) for path in arguments.recordings]
     names = Counter(recording.name for recording in recordings)
     if twice := [name for name, n in names.items() if n > 1]:
         raise ConfigError(f"two recordings are named {twice[0]!r}: their pairs would mix")
@@ -81,6 +88,8 @@ def run(arguments: argparse.Namespace) -> None:
         dataset = open_dataset(arguments.out, pipeline, sampling, create=True)
         for recording in recordings:
             facts = {"n_scans": len(recording), "fingerprint": fingerprint(recording)}
+            if sampling.noise_m > 0.0:
+                facts["noise"] = "rescans" if isinstance(recording, Simulation) else "added"
             dataset.add_recording(recording.name, facts)
         try:
             with threadpool_limits(1, user_api="blas"):  # its threads take the kernels' cores

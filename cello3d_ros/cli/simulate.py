@@ -9,6 +9,7 @@ from pathlib import Path
 
 from cello3d_ros.cli.sources import with_progress
 from cello3d_ros.errors import RecordingError
+from cello3d_ros.recordings.rescan import KEY, told
 from cello3d_ros.recordings.scanner import SCANNERS, Scanner
 from cello3d_ros.recordings.simulation import Simulation
 from cello3d_ros.recordings.worlds import WORLDS
@@ -53,7 +54,8 @@ def run(arguments: argparse.Namespace) -> None:
         )
         out = arguments.out if arguments.seeds is None else arguments.out / simulation.name
         progress = with_progress(simulation, len(simulation), simulation.name)
-        write_bag(out, progress, provenance={"made_by": _command(arguments, seed)})
+        provenance = {"made_by": _command(arguments, seed), KEY: told(simulation)}
+        write_bag(out, progress, provenance=provenance)
         print(f"{out}: {len(simulation)} scans of {simulation.name}")
 
 

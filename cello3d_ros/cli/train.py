@@ -17,7 +17,7 @@ from cello3d_ros.errors import Cello3dError, DatasetError
 if TYPE_CHECKING:
     from cello3d_ros.learning.evaluation import Figures
 
-_FLAGS = ("shape", "theta", "loss", "optimizer")
+_FLAGS = ("shape", "features", "theta", "loss", "optimizer")
 _COLUMNS = (  # heading, figure
     ("KL mean", "kl_mean"),
     ("median", "kl_median"),

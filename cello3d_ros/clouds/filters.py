@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from cello3d_ros.geometry.se3 import Array
@@ -20,19 +21,13 @@ def limit_density(
 ) -> Array:
     """Return the points with at most ``max_points`` in each cube of side ``voxel_m``.
 
-    Those kept in a crowded cube are a uniform random draw.  (N, 3) -> (M, 3), order kept.
+    Those kept in a crowded cube are a uniform random draw: the first of all points shuffled.
+    (N, 3) -> (M, 3), order kept.
     """
     if len(points) == 0:
         return points
-    cells = np.floor((points - points.min(axis=0)) / voxel_m).astype(np.int64)
-    sides = cells.max(axis=0) + 1
-    keys = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
-    shuffled = rng.permutation(len(points))
-    order = shuffled[np.argsort(keys[shuffled], kind="stable")]
-    ordered = keys[order]
-    first = np.flatnonzero(np.r_[True, ordered[1:] != ordered[:-1]])
-    rank = np.arange(len(points)) - np.repeat(first, np.diff(np.r_[first, len(points)]))
-    return points[np.sort(order[rank < max_points])]
+    points = np.ascontiguousarray(points)
+    return points[_first_of_cells(points, voxel_m, max_points, rng.permutation(len(points)))]
 
 
 def subsample(n_points: int, n_kept: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -43,3 +38,59 @@ def subsample(n_points: int, n_kept: int, rng: np.random.Generator) -> NDArray[n
     if n_points <= n_kept:
         return np.arange(n_points)
     return np.sort(rng.choice(n_points, n_kept, replace=False, shuffle=False))
+
+
+@njit(cache=True, nogil=True)
+def _first_of_cells(
+    points: Array, voxel_m: float, max_points: int, turns: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Return which points are among the first ``max_points`` of their cell, in order of turns.
+
+    A hash table of twice as many slots as points holds for each cell the point that opened it; a
+    slot that another cell has taken sends the search on to the next.
+    """
+    n = len(points)
+    n_slots = 2
+    while n_slots < 2 * n:
+        n_slots *= 2
+    opened = np.full(n_slots, -1, np.int32)
+    counts = np.zeros(n_slots, np.int32)
+    slots = np.empty(n, np.int32)
+    cells = np.empty((n, 3))
+    x0, y0, z0 = points[:, 0].min(), points[:, 1].min(), points[:, 2].min()
+    for i in range(n):
+        x = np.floor((points[i, 0] - x0) / voxel_m)
+        y = np.floor((points[i, 1] - y0) / voxel_m)
+        z = np.floor((points[i, 2] - z0) / voxel_m)
+        cells[i, 0], cells[i, 1], cells[i, 2] = x, y, z
+        slot = _hash(x, y, z) & (n_slots - 1)
+        while True:
+            j = opened[slot]
+            if j < 0:
+                opened[slot] = i
+                break
+            if cells[j, 0] == x and cells[j, 1] == y and cells[j, 2] == z:
+                break
+            slot = (slot + 1) & (n_slots - 1)
+        slots[i] = slot
+        counts[slot] += 1
+    kept = np.empty(n, np.bool_)
+    for i in range(n):
+        kept[i] = counts[slots[i]] <= max_points
+    counts[:] = 0
+    for i in turns:
+        if not kept[i]:
+            kept[i] = counts[slots[i]] < max_points
+            counts[slots[i]] += 1
+    return kept
+
+
+@njit(cache=True, nogil=True)
+def _hash(x: float, y: float, z: float) -> int:
+    """Return a number that neighbouring cells share by chance only (wrapping multiplication)."""
+    h = np.uint64(np.int64(x)) * np.uint64(0x9E3779B97F4A7C15)
+    h = (h ^ (h >> np.uint64(29))) + np.uint64(np.int64(y))
+    h *= np.uint64(0xBF58476D1CE4E5B9)
+    h = (h ^ (h >> np.uint64(32))) + np.uint64(np.int64(z))
+    h *= np.uint64(0x94D049BB133111EB)
+    return int((h ^ (h >> np.uint64(29))) >> np.uint64(1))

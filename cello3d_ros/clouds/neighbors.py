@@ -1,131 +1,185 @@
-"""Exact nearest neighbours: a balanced k-d tree of boxes, in compiled kernels.
+"""Exact nearest neighbours of many queries, sixteen at a time.
 
 They serve the local shape of a cloud and the overlap of two, hence this lowest room; ICP has a
-search of its own (``registration/search.py``).  The tree is implicit: node i has the children
-2i + 1 and 2i + 2, and each half of a node's points goes to one child, so that only the nodes'
-bounding boxes and the leaves' ranges of points are stored.  A box is pruned when its distance is
-not below that of the k-th neighbour found so far: exact.  Kernels release the GIL, so that threads
-can share a tree.
+search of its own (``registration/search.py``).  Sixteen queries in a row look for their leaves
+together, within a radius that is guessed from the queries before.  The guess is verified: where
+it holds fewer than k points the search is done again with a greater one, so that the answers are
+exact whatever the guess, and do not depend on how the queries are shared among threads.  Of
+equally far points the first in the order of the tree wins.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from cello3d_ros.clouds.leaves import (
+    WIDTH,
+    Indices,
+    Leaves,
+    boxes_near,
+    build_leaves,
+    in_threads,
+    leaves_near,
+    lowest_bit,
+    points_near,
+    tree_order,
+)
 from cello3d_ros.geometry.se3 import Array
 
-Indices = NDArray[np.int64]
+__all__ = ["Indices", "KdTree", "any_within", "build_tree", "nearest", "select"]
 
-_LEAF = 12  # most points of a leaf; larger leaves scan more, smaller ones descend more
-_CHUNK = 4096  # queries of one task
+_FAR2 = 1.7e308  # no finite squared distance is searched for beyond
+_CHUNK = 4096  # queries of one task, a multiple of 16
+_LEAST2 = 1e-290  # from where a radius grows that was guessed to be nothing
 
 
 class KdTree(NamedTuple):
     """A tree over N points.
 
-    points: (N, 3) in tree order; order: (N,) their indices in the given array; boxes: (2L - 1, 6)
-    least and greatest coordinates of each node; leaves: (L + 1,) where each leaf's points start.
+    points: (N, 3) in tree order; order: (N,) their indices in the given array; lanes, boxes,
+    children: the fields of ``Leaves``.
     """
 
     points: Array
     order: Indices
+    lanes: Array
     boxes: Array
-    leaves: Indices
+    children: Indices
+
+    @property
+    def leaves(self) -> Leaves:
+        """The part that is searched."""
+        return Leaves(self.lanes, self.boxes, self.children)
 
 
-def build_tree(points: Array) -> KdTree:
-    """Build a k-d tree of (N, 3) finite points, N > 0."""
+def build_tree(points: Array, n_threads: int = 1) -> KdTree:
+    """Build a tree of (N, 3) finite points, N > 0."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     if len(points) == 0:
         raise ValueError("a k-d tree needs at least one point")
-    order = np.arange(len(points))
-    boxes, leaves = _build(points, order)
-    return KdTree(points[order], order, boxes, leaves)
+    order = tree_order(points, n_threads)
+    ordered = points[order]
+    return KdTree(ordered, order, *build_leaves(ordered))
 
 
-def nearest(tree: KdTree, queries: Array, k: int) -> tuple[Array, Indices]:
+def nearest(
+    tree: KdTree, queries: Array, k: int, n_threads: int = 1, max_distance2: float = np.inf
+) -> tuple[Array, Indices]:
     """Return squared distances and tree-order indices of the k nearest points, closest first.
 
-    queries: (M, 3).  Returns (M, k) and (M, k); infinite and -1 where the tree has fewer than k.
+    queries: (M, 3), fastest when neighbours in order are near in space; max_distance2: points
+    farther, squared, are left out.  Returns (M, k) and (M, k); infinite and -1 where there are
+    fewer than k.
     """
+    queries = np.ascontiguousarray(queries, dtype=np.float64)
     distances2 = np.empty((len(queries), k))
     indices = np.empty((len(queries), k), np.int64)
 
     def task(part: slice) -> None:
-        _nearest_many(tree, queries[part], distances2[part], indices[part])
+        _nearest(tree.leaves, queries[part], max_distance2, distances2[part], indices[part])
 
-    in_chunks(task, len(queries))
+    parts = [slice(i, i + _CHUNK) for i in range(0, len(queries), _CHUNK)]
+    in_threads(task, parts, n_threads)
     return distances2, indices
 
 
-def any_within(tree: KdTree, queries: Array, radius: float) -> NDArray[np.bool_]:
+def any_within(
+    tree: KdTree, queries: Array, radius: float, n_threads: int = 1
+) -> NDArray[np.bool_]:
     """Return for each query (M, 3) whether a point of the tree is at most ``radius`` away."""
-    found = np.empty(len(queries), np.bool_)
-
-    def task(part: slice) -> None:
-        _any_within_many(tree, queries[part], radius**2, found[part])
-
-    in_chunks(task, len(queries))
-    return found
-
-
-def in_chunks(task: Callable[[slice], Any], n: int) -> None:
-    """Run ``task`` on slices that cover range(n), in threads; their results never overlap."""
-    parts = [slice(start, min(start + _CHUNK, n)) for start in range(0, n, _CHUNK)]
-    n_threads = min(len(parts), os.cpu_count() or 1)
-    if n_threads <= 1:
-        for part in parts:
-            task(part)
-        return
-    with ThreadPoolExecutor(n_threads) as pool:
-        list(pool.map(task, parts))
+    _, indices = nearest(tree, queries, 1, n_threads, radius**2)
+    return np.asarray(indices[:, 0] >= 0)
 
 
 @njit(cache=True, nogil=True)
-def _build(points: Array, order: Indices) -> tuple[Array, Indices]:
-    """Sort ``order`` into tree order, level by level; return the boxes and the leaves."""
-    n_leaves = 1
-    while n_leaves * _LEAF < len(points):
-        n_leaves *= 2
-    boxes = np.empty((2 * n_leaves - 1, 6))
-    starts = np.empty(n_leaves + 1, np.int64)
-    starts[0] = 0
-    starts[1] = len(points)
-    n_nodes = 1
-    while True:
-        level = boxes[n_nodes - 1 : 2 * n_nodes - 1]
-        for i in range(n_nodes):
-            _bound(points, order, starts[i], starts[i + 1], level[i])
-        if n_nodes == n_leaves:
-            return boxes, starts
-        for i in range(n_nodes, 0, -1):  # halve each range, in place, from the last
-            starts[2 * i] = starts[i]
-            starts[2 * i - 1] = (starts[i - 1] + starts[i]) // 2
-        for i in range(n_nodes):
-            axis = int(np.argmax(level[i, 3:] - level[i, :3]))
-            select(points, order, starts[2 * i], starts[2 * i + 2] - 1, starts[2 * i + 1], axis)
-        n_nodes *= 2
+def _nearest(
+    leaves: Leaves, queries: Array, max2: float, distances2: Array, indices: Indices
+) -> None:
+    """Fill the neighbours of the queries, closest first.
+
+    far2 is the search radius of the sixteen, squared, bound2 that of one: at most far2, less
+    where the neighbours of the query before say so.  Both grow until k are found within.
+    """
+    points = leaves.points
+    n, k = indices.shape
+    max2 = min(max2, _FAR2)
+    near = np.empty(len(points), np.int64)
+    near_boxes = np.empty((len(points) // 16 + 1, 6, 16))
+    stack = np.empty(256, np.int64)
+    box = np.empty(6)
+    guess2 = most2 = _LEAST2  # the last k-th distance, squared; the greatest of the last sixteen
+    for start in range(0, n, WIDTH):
+        stop = min(start + WIDTH, n)
+        for a in range(3):
+            box[a] = queries[start:stop, a].min()
+            box[3 + a] = queries[start:stop, a].max()
+        far2 = min(1.5 * most2, max2)
+        growth, most2, i, n_near = 2.0, _LEAST2, start, -1
+        while i < stop:
+            if n_near < 0:
+                n_near = leaves_near(leaves, box, far2, stack, near, near_boxes)
+            bound2 = min(1.5 * guess2, far2)
+            while not _scan(
+                points, near, near_boxes, n_near, queries, i, bound2, distances2, indices
+            ):
+                if bound2 >= far2:
+                    break
+                bound2 = min(4.0 * bound2, far2)
+            if indices[i, k - 1] < 0 and far2 < max2:
+                far2 = min(growth * far2, max2)
+                growth, guess2, n_near = 2.0 * growth, far2, -1
+                continue
+            guess2 = max(min(distances2[i, k - 1], bound2), _LEAST2)
+            most2 = max(most2, guess2)
+            i += 1
 
 
 @njit(cache=True, nogil=True)
-def _bound(points: Array, order: Indices, lo: int, hi: int, box: Array) -> None:
-    """Fill ``box`` with the least and greatest coordinates of a range."""
-    for a in range(3):
-        least = np.inf
-        greatest = -np.inf
-        for j in range(lo, hi):
-            value = points[order[j], a]
-            least = min(least, value)
-            greatest = max(greatest, value)
-        box[a] = least
-        box[3 + a] = greatest
+def _scan(
+    points: Array,
+    near: Indices,
+    near_boxes: Array,
+    n_near: int,
+    queries: Array,
+    i: int,
+    bound2: float,
+    distances2: Array,
+    indices: Indices,
+) -> bool:
+    """Fill query i's neighbours at most ``bound2`` away, squared; return whether there are k."""
+    k = indices.shape[1]
+    x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
+    for j in range(k):
+        distances2[i, j] = np.inf
+        indices[i, j] = -1
+    for block in range((n_near + 15) >> 4):
+        mask = boxes_near(near_boxes, block, x, y, z, bound2)
+        while mask:
+            leaf = near[16 * block + lowest_bit(mask)]
+            mask &= mask - 1
+            hits = points_near(points, leaf, x, y, z, bound2)
+            while hits:
+                lane = lowest_bit(hits)
+                hits &= hits - 1
+                dx = points[leaf, 0, lane] - x
+                dy = points[leaf, 1, lane] - y
+                dz = points[leaf, 2, lane] - z
+                d2 = dx * dx + dy * dy + dz * dz
+                j = k - 1
+                if d2 >= distances2[i, j]:
+                    continue
+                while j > 0 and d2 < distances2[i, j - 1]:
+                    distances2[i, j] = distances2[i, j - 1]
+                    indices[i, j] = indices[i, j - 1]
+                    j -= 1
+                distances2[i, j] = d2
+                indices[i, j] = 16 * leaf + lane
+            bound2 = min(bound2, distances2[i, k - 1])
+    return bool(indices[i, k - 1] >= 0)
 
 
 @njit(cache=True, nogil=True)
@@ -150,96 +204,3 @@ def select(points: Array, order: Indices, lo: int, hi: int, middle: int, axis: i
             lo = i
         else:
             return
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _box_distance2(box: Array, x: float, y: float, z: float) -> float:
-    """Return the squared distance from a point to a box, 0 inside."""
-    dx = max(max(box[0] - x, x - box[3]), 0.0)
-    dy = max(max(box[1] - y, y - box[4]), 0.0)
-    dz = max(max(box[2] - z, z - box[5]), 0.0)
-    return float(dx * dx + dy * dy + dz * dz)
-
-
-@njit(cache=True, nogil=True)
-def nearest_one(
-    tree: KdTree,
-    x: float,
-    y: float,
-    z: float,
-    bound2: float,
-    enough2: float,
-    distances2: Array,
-    indices: Indices,
-    stack: Array,
-) -> int:
-    """Fill the neighbours of one query that are nearer than ``bound2``, squared; count them.
-
-    The search ends early once the farthest neighbour is at most ``enough2`` away, squared.
-    distances2, indices: (k,), closest first; infinite and -1 where fewer are found.  stack:
-    (64, 2) scratch of (node, squared distance of its box).
-    """
-    points, _, boxes, leaves = tree
-    k = len(distances2)
-    distances2[:] = np.inf
-    indices[:] = -1
-    worst = bound2
-    n_inner = len(leaves) - 2
-    top = n_found = 0
-    node = 0
-    node2 = _box_distance2(boxes[0], x, y, z)
-    while True:
-        while node2 < worst and node < n_inner:  # to the nearer child; remember the other
-            left = 2 * node + 1
-            left2 = _box_distance2(boxes[left], x, y, z)
-            right2 = _box_distance2(boxes[left + 1], x, y, z)
-            left_first = left2 <= right2
-            node = left if left_first else left + 1
-            node2 = left2 if left_first else right2
-            far2 = right2 if left_first else left2
-            if far2 < worst:
-                stack[top, 0] = 2 * left + 1 - node
-                stack[top, 1] = far2
-                top += 1
-        if node2 < worst:
-            for p in range(leaves[node - n_inner], leaves[node - n_inner + 1]):
-                dx = points[p, 0] - x
-                dy = points[p, 1] - y
-                dz = points[p, 2] - z
-                d2 = dx * dx + dy * dy + dz * dz
-                if d2 < worst:
-                    n_found = min(n_found + 1, k)
-                    j = k - 1
-                    while j > 0 and distances2[j - 1] > d2:
-                        distances2[j] = distances2[j - 1]
-                        indices[j] = indices[j - 1]
-                        j -= 1
-                    distances2[j] = d2
-                    indices[j] = p
-                    worst = min(worst, distances2[k - 1])
-        if top == 0 or worst <= enough2:
-            return n_found
-        top -= 1
-        node = int(stack[top, 0])
-        node2 = stack[top, 1]
-
-
-@njit(cache=True, nogil=True)
-def _nearest_many(tree: KdTree, queries: Array, distances2: Array, indices: Indices) -> None:
-    stack = np.empty((64, 2))
-    for q in range(len(queries)):
-        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        nearest_one(tree, x, y, z, np.inf, -1.0, distances2[q], indices[q], stack)
-
-
-@njit(cache=True, nogil=True)
-def _any_within_many(
-    tree: KdTree, queries: Array, radius2: float, found: NDArray[np.bool_]
-) -> None:
-    stack = np.empty((64, 2))
-    distance2 = np.empty(1)
-    index = np.empty(1, np.int64)
-    bound2 = np.nextafter(radius2, np.inf)  # a point at the radius itself is within
-    for q in range(len(queries)):
-        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        found[q] = nearest_one(tree, x, y, z, bound2, radius2, distance2, index, stack) > 0

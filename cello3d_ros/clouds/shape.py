@@ -8,17 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from cello3d_ros.clouds.covariances import covariances
 from cello3d_ros.clouds.filters import crop_range, limit_density
-from cello3d_ros.clouds.neighbors import (
-    Indices,
-    KdTree,
-    build_tree,
-    in_chunks,
-    nearest_one,
-)
+from cello3d_ros.clouds.leaves import WIDTH, in_threads
+from cello3d_ros.clouds.neighbors import KdTree, build_tree
 from cello3d_ros.config import CloudConfig
 from cello3d_ros.errors import CloudError
 from cello3d_ros.geometry.se3 import Array
+
+_CHUNK = 256  # leaves of one task
 
 
 class Cloud(NamedTuple):
@@ -36,11 +34,13 @@ class Cloud(NamedTuple):
     tree: KdTree
 
 
-def prepare(points: Array, config: CloudConfig, rng: np.random.Generator) -> Cloud:
+def prepare(
+    points: Array, config: CloudConfig, rng: np.random.Generator, n_threads: int = 1
+) -> Cloud:
     """Filter a scan and compute its local shape.
 
-    points: (N, 3) finite, sensor frame.  Raises CloudError when fewer than ``n_neighbors`` are
-    left after the filters.
+    points: (N, 3) finite, sensor frame; the result does not depend on n_threads.  Raises
+    CloudError when fewer than ``n_neighbors`` are left after the filters.
     """
     cropped = crop_range(points, config.min_range_m, config.max_range_m)
     kept = limit_density(cropped, config.voxel_m, config.max_points_per_voxel, rng)
@@ -49,12 +49,12 @@ def prepare(points: Array, config: CloudConfig, rng: np.random.Generator) -> Clo
             f"{len(kept)} of {len(points)} points are left between {config.min_range_m:g} m and "
             f"{config.max_range_m:g} m, need at least {config.n_neighbors}"
         )
-    tree = build_tree(kept)
+    tree = build_tree(kept, n_threads)
     tree = tree._replace(order=np.arange(len(kept)))
-    return Cloud(tree.points, *local_shape(tree, config.n_neighbors), tree)
+    return Cloud(tree.points, *local_shape(tree, config.n_neighbors, n_threads), tree)
 
 
-def local_shape(tree: KdTree, k: int) -> tuple[Array, Array, Array]:
+def local_shape(tree: KdTree, k: int, n_threads: int = 1) -> tuple[Array, Array, Array]:
     """Return normals (N, 3), planarity (N,) and cylindricality (N,) of the points of a tree.
 
     Of the covariance of the k nearest points (the point itself among them), s1 >= s2 >= s3 being
@@ -62,125 +62,109 @@ def local_shape(tree: KdTree, k: int) -> tuple[Array, Array, Array]:
     (s2 - s3) / s1 and cylindricality (s1 - s2) / s1; both are 0 where all neighbours coincide.
     Source: Demantke et al. 2011.
     """
-    n = len(tree.points)
+    n, n_leaves = len(tree.points), len(tree.lanes)
     normals, planarity, cylindricality = np.empty((n, 3)), np.empty(n), np.empty(n)
 
-    def task(part: slice) -> None:
-        _local_shape(
-            tree, k, part.start, part.stop, normals[part], planarity[part], cylindricality[part]
-        )
+    def task(first: int) -> None:
+        stop = min(first + _CHUNK, n_leaves)
+        near = np.empty((stop - first, 6, WIDTH))
+        covariances(tree.leaves, n, k, first, stop, near)
+        part = slice(WIDTH * first, WIDTH * stop)
+        _shape(near, normals[part], planarity[part], cylindricality[part])
 
-    in_chunks(task, n)
+    in_threads(task, list(range(0, n_leaves, _CHUNK)), n_threads)
     return normals, planarity, cylindricality
 
 
-@njit(cache=True, nogil=True)
-def _local_shape(
-    tree: KdTree,
-    k: int,
-    start: int,
-    stop: int,
-    normals: Array,
-    planarity: Array,
-    cylindricality: Array,
-) -> None:
-    points = tree.points
-    stack = np.empty((64, 2))
-    distances2 = np.empty(k)
-    indices = np.empty(k, np.int64)
-    for i in range(stop - start):
-        x, y, z = points[start + i, 0], points[start + i, 1], points[start + i, 2]
-        nearest_one(tree, x, y, z, np.inf, -1.0, distances2, indices, stack)
-        xx, yy, zz, xy, xz, yz = _covariance(points, indices, x, y, z)
-        largest, middle, least, normal = _eigen(xx, yy, zz, xy, xz, yz)
-        s1, s2, s3 = math.sqrt(largest), math.sqrt(middle), math.sqrt(least)
-        normals[i, 0], normals[i, 1], normals[i, 2] = normal
-        planarity[i] = (s2 - s3) / s1 if s1 > 0.0 else 0.0
-        cylindricality[i] = (s1 - s2) / s1 if s1 > 0.0 else 0.0
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shape(near: Array, normals: Array, planarity: Array, cylindricality: Array) -> None:
+    """Fill the shape of each covariance of near, (L, 6, 16).
 
-
-@njit(cache=True, nogil=True)
-def _covariance(
-    points: Array, indices: Indices, x: float, y: float, z: float
-) -> tuple[float, float, float, float, float, float]:
-    """Return xx, yy, zz, xy, xz, yz of the points at ``indices``, taken relative to (x, y, z)."""
-    n = 0
-    mx = my = mz = xx = xy = xz = yy = yz = zz = 0.0
-    for index in indices:
-        if index < 0:
-            break
-        dx, dy, dz = points[index, 0] - x, points[index, 1] - y, points[index, 2] - z
-        n += 1
-        mx += dx
-        my += dy
-        mz += dz
-        xx += dx * dx
-        xy += dx * dy
-        xz += dx * dz
-        yy += dy * dy
-        yz += dy * dz
-        zz += dz * dz
-    mx, my, mz = mx / n, my / n, mz / n
-    return (
-        xx / n - mx * mx,
-        yy / n - my * my,
-        zz / n - mz * mz,
-        xy / n - mx * my,
-        xz / n - mx * mz,
-        yz / n - my * mz,
-    )
-
-
-@njit(cache=True, nogil=True)
-def _eigen(
-    xx: float, yy: float, zz: float, xy: float, xz: float, yz: float
-) -> tuple[float, float, float, tuple[float, float, float]]:
-    """Return the eigenvalues of a covariance, descending, and the direction of the least.
-
-    Cyclic Jacobi rotations, until what is left off the diagonal moves nothing in double precision:
-    it enters the eigenvalues squared.
+    Cyclic Jacobi rotations of sixteen matrices at a time, until what is left off the diagonal
+    moves nothing in double precision: it enters the eigenvalues squared.  w holds the rows xx, yy,
+    zz, xy, xz, yz, the directions a, b, c that become the eigenvectors of xx, yy, zz, and what is
+    small beside the matrix.
     """
-    ax, ay, az = 1.0, 0.0, 0.0  # the directions a, b, c that become the eigenvectors of xx, yy, zz
-    bx, by, bz = 0.0, 1.0, 0.0
-    cx, cy, cz = 0.0, 0.0, 1.0
-    small = 1e-24 * (xx + yy + zz) ** 2
-    for _ in range(30):
-        if xy * xy + xz * xz + yz * yz <= small:
-            break
-        xx, yy, xz, yz, c, s = _rotated(xx, yy, xy, xz, yz)
-        xy = 0.0
+    w = np.empty(16 * 16)
+    for g in range(len(near)):
+        w[: 6 * 16] = near[g].ravel()
+        w[6 * 16 : 15 * 16] = 0.0
+        w[6 * 16 : 7 * 16] = w[10 * 16 : 11 * 16] = w[14 * 16 : 15 * 16] = 1.0
+        for lane in range(16):
+            w[15 * 16 + lane] = 1e-24 * (w[lane] + w[16 + lane] + w[32 + lane]) ** 2
+        for _ in range(30):
+            n_left = 0
+            for lane in range(16):
+                xy, xz, yz = w[48 + lane], w[64 + lane], w[80 + lane]
+                n_left += xy * xy + xz * xz + yz * yz > w[240 + lane]
+            if n_left == 0:
+                break
+            _sweep(w)
+        _write(w, WIDTH * g, normals, planarity, cylindricality)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sweep(w: Array) -> None:
+    """Rotate each matrix of w in the planes of x and y, x and z, y and z, if it needs it yet."""
+    for lane in range(16):
+        xx, yy, zz = w[lane], w[16 + lane], w[32 + lane]
+        xy, xz, yz = w[48 + lane], w[64 + lane], w[80 + lane]
+        ax, ay, az = w[96 + lane], w[112 + lane], w[128 + lane]
+        bx, by, bz = w[144 + lane], w[160 + lane], w[176 + lane]
+        cx, cy, cz = w[192 + lane], w[208 + lane], w[224 + lane]
+        live = xy * xy + xz * xz + yz * yz > w[240 + lane]
+        c, s, t = _rotation(xx, yy, xy, live)
+        xx, yy, xz, yz = xx - t * xy, yy + t * xy, c * xz - s * yz, s * xz + c * yz
+        xy = 0.0 if live else xy
         ax, bx = c * ax - s * bx, s * ax + c * bx
         ay, by = c * ay - s * by, s * ay + c * by
         az, bz = c * az - s * bz, s * az + c * bz
-        xx, zz, xy, yz, c, s = _rotated(xx, zz, xz, xy, yz)
-        xz = 0.0
+        c, s, t = _rotation(xx, zz, xz, live)
+        xx, zz, xy, yz = xx - t * xz, zz + t * xz, c * xy - s * yz, s * xy + c * yz
+        xz = 0.0 if live else xz
         ax, cx = c * ax - s * cx, s * ax + c * cx
         ay, cy = c * ay - s * cy, s * ay + c * cy
         az, cz = c * az - s * cz, s * az + c * cz
-        yy, zz, xy, xz, c, s = _rotated(yy, zz, yz, xy, xz)
-        yz = 0.0
+        c, s, t = _rotation(yy, zz, yz, live)
+        yy, zz, xy, xz = yy - t * yz, zz + t * yz, c * xy - s * xz, s * xy + c * xz
+        yz = 0.0 if live else yz
         bx, cx = c * bx - s * cx, s * bx + c * cx
         by, cy = c * by - s * cy, s * by + c * cy
         bz, cz = c * bz - s * cz, s * bz + c * cz
-    least, normal = xx, (ax, ay, az)
-    if yy < least:
-        least, normal = yy, (bx, by, bz)
-    if zz < least:
-        least, normal = zz, (cx, cy, cz)
-    largest = max(xx, yy, zz)
-    middle = max(min(xx, yy), min(max(xx, yy), zz))
-    return max(largest, 0.0), max(middle, 0.0), max(least, 0.0), normal
+        w[lane], w[16 + lane], w[32 + lane] = xx, yy, zz
+        w[48 + lane], w[64 + lane], w[80 + lane] = xy, xz, yz
+        w[96 + lane], w[112 + lane], w[128 + lane] = ax, ay, az
+        w[144 + lane], w[160 + lane], w[176 + lane] = bx, by, bz
+        w[192 + lane], w[208 + lane], w[224 + lane] = cx, cy, cz
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _rotated(
-    pp: float, qq: float, pq: float, pr: float, qr: float
-) -> tuple[float, float, float, float, float, float]:
-    """Return pp, qq, pr, qr after the rotation in the plane of p and q that makes pq 0: (c, s)."""
-    if pq == 0.0:
-        return pp, qq, pr, qr, 1.0, 0.0
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def _rotation(pp: float, qq: float, pq: float, live: bool) -> tuple[float, float, float]:
+    """Return cosine, sine and tangent of the rotation that makes pq 0; none if it is not live."""
     theta = 0.5 * (qq - pp) / pq
-    t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1.0))
+    t = 1.0 / (abs(theta) + math.sqrt(theta * theta + 1.0))
+    t = -t if theta < 0.0 else t
+    t = t if live and pq != 0.0 else 0.0
     c = 1.0 / math.sqrt(t * t + 1.0)
-    s = t * c
-    return pp - t * pq, qq + t * pq, c * pr - s * qr, s * pr + c * qr, c, s
+    return c, t * c, t
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _write(w: Array, first: int, normals: Array, planarity: Array, cylindricality: Array) -> None:
+    """Write the shapes of the diagonal matrices of w, from point ``first`` on."""
+    for lane in range(min(16, len(normals) - first)):
+        i = first + lane
+        xx, yy, zz = w[lane], w[16 + lane], w[32 + lane]
+        axis = 6
+        if yy < xx:
+            axis = 9
+        if zz < min(xx, yy):
+            axis = 12
+        for a in range(3):
+            normals[i, a] = w[16 * (axis + a) + lane]
+        largest, least = max(max(xx, yy), zz), min(min(xx, yy), zz)
+        middle = max(min(xx, yy), min(max(xx, yy), zz))
+        s1, s2 = math.sqrt(max(largest, 0.0)), math.sqrt(max(middle, 0.0))
+        s3 = math.sqrt(max(least, 0.0))
+        planarity[i] = (s2 - s3) / s1 if s1 > 0.0 else 0.0
+        cylindricality[i] = (s1 - s2) / s1 if s1 > 0.0 else 0.0

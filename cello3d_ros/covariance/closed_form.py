@@ -176,27 +176,46 @@ def _normal_matrices(
     """Return H = sum J^T J and G = sum_i g_i g_i^T, g_i = sum J^T r over one point's neighbours.
 
     The residual of ``T exp(xi) p`` has the Jacobian ``[m, p x m]``, m = R^T n: the reading side.
+    All of one point's are ``A m`` with the same ``A = [I; hat(p)]``, so that it adds
+    ``A M A^T`` to H, M = sum m m^T, and ``g = A sum m r``.
     """
     H, G = np.zeros((6, 6)), np.zeros((6, 6))
-    J, g = np.empty(6), np.empty(6)
+    M, B, g = np.empty((3, 3)), np.empty((3, 3)), np.empty(6)
     for i in range(len(moved)):
-        g[:] = 0.0
-        x, y, z = reading[i, 0], reading[i, 1], reading[i, 2]
+        xx = yy = zz = xy = xz = yz = a = b = c = 0.0
         for j in range(indices.shape[1]):
             if not distances2[i, j] <= limit:
                 break
             q = indices[i, j]
-            r = 0.0
-            for a in range(3):
-                J[a] = R[0, a] * normals[q, 0] + R[1, a] * normals[q, 1] + R[2, a] * normals[q, 2]
-                r += (moved[i, a] - points[q, a]) * normals[q, a]
-            J[3] = y * J[2] - z * J[1]
-            J[4] = z * J[0] - x * J[2]
-            J[5] = x * J[1] - y * J[0]
-            for u in range(6):
-                g[u] += J[u] * r
-                for v in range(u + 1):
-                    H[u, v] += J[u] * J[v]
+            nx, ny, nz = normals[q, 0], normals[q, 1], normals[q, 2]
+            r = (moved[i, 0] - points[q, 0]) * nx
+            r += (moved[i, 1] - points[q, 1]) * ny
+            r += (moved[i, 2] - points[q, 2]) * nz
+            x = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
+            y = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
+            z = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz
+            xx, yy, zz = xx + x * x, yy + y * y, zz + z * z
+            xy, xz, yz = xy + x * y, xz + x * z, yz + y * z
+            a, b, c = a + x * r, b + y * r, c + z * r
+        if xx + yy + zz == 0.0:
+            continue
+        M[0, 0], M[0, 1], M[0, 2] = xx, xy, xz
+        M[1, 0], M[1, 1], M[1, 2] = xy, yy, yz
+        M[2, 0], M[2, 1], M[2, 2] = xz, yz, zz
+        x, y, z = reading[i, 0], reading[i, 1], reading[i, 2]
+        for u in range(3):  # hat(p) M, M being symmetric: row by row its transpose
+            B[u, 0] = y * M[u, 2] - z * M[u, 1]
+            B[u, 1] = z * M[u, 0] - x * M[u, 2]
+            B[u, 2] = x * M[u, 1] - y * M[u, 0]
+        for u in range(3):
+            H[3 + u, 3] += y * B[2, u] - z * B[1, u]
+            H[3 + u, 4] += z * B[0, u] - x * B[2, u]
+            H[3 + u, 5] += x * B[1, u] - y * B[0, u]
+            for v in range(3):
+                H[u, v] += M[u, v]
+                H[3 + v, u] += B[u, v]
+        g[0], g[1], g[2] = a, b, c
+        g[3], g[4], g[5] = y * c - z * b, z * a - x * c, x * b - y * a
         for u in range(6):
             for v in range(u + 1):
                 G[u, v] += g[u] * g[v]

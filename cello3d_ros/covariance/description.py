@@ -9,9 +9,10 @@ import numpy as np
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import Pipeline
 from cello3d_ros.covariance.closed_form import closed_form
-from cello3d_ros.covariance.descriptor import describe_overlap
+from cello3d_ros.covariance.descriptor import describe_clouds
+from cello3d_ros.covariance.features import global_features
 from cello3d_ros.errors import NoOverlapError
-from cello3d_ros.geometry.se3 import Array, inverse, transform
+from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.registration.overlap import Overlap, find_overlap
 
 
@@ -20,34 +21,41 @@ class Description(NamedTuple):
 
     n_overlap: overlapping points of both clouds; overlap_ratio: share of the reading's points;
     descriptors: (n_rotations, n_features), the k-th after a turn of the reading frame by
-    2 pi k / n_rotations about z; shapes: cheap predictors by name, each (6, 6), reading side;
-    overlap: the associations that all of it comes from.
+    2 pi k / n_rotations about z; features: the numbers that ``FEATURES`` names; shapes: cheap
+    predictors by name, each (6, 6), reading side; overlap: the associations that all of it comes
+    from.
     """
 
     n_overlap: int
     overlap_ratio: float
     descriptors: Array
+    features: Array
     shapes: dict[str, Array]
     overlap: Overlap
 
 
 def describe(
-    reading: Cloud, reference: Cloud, T_ref_read: Array, pipeline: Pipeline, n_rotations: int = 1
+    reading: Cloud,
+    reference: Cloud,
+    T_ref_read: Array,
+    pipeline: Pipeline,
+    n_rotations: int = 1,
+    n_threads: int = 1,
 ) -> Description:
     """Describe a registered pair.
 
-    T_ref_read: (4, 4).  Raises NoOverlapError when too little overlaps and RegistrationError
-    when the geometry leaves a direction free.
+    T_ref_read: (4, 4); n_threads changes no result.  Raises NoOverlapError when too little
+    overlaps and RegistrationError when the geometry leaves a direction free.
     """
-    overlap = find_overlap(
-        reading, reference, T_ref_read, pipeline.overlap.radius_m, pipeline.icp.n_neighbors
-    )
+    radius_m, k = pipeline.overlap.radius_m, pipeline.icp.n_neighbors
+    overlap = find_overlap(reading, reference, T_ref_read, radius_m, k, n_threads)
     _check_overlap(overlap, pipeline)
     shapes = closed_form(
         reading, reference, T_ref_read, overlap.distances2, overlap.indices, pipeline.icp
     )._asdict()
     descriptors = _descriptors(reading, reference, T_ref_read, overlap, pipeline, n_rotations)
-    return Description(overlap.n_points, overlap.ratio, descriptors, shapes, overlap)
+    features = global_features(reading, reference, T_ref_read, overlap, shapes, pipeline.icp)
+    return Description(overlap.n_points, overlap.ratio, descriptors, features, shapes, overlap)
 
 
 def turns(n_rotations: int) -> Array:
@@ -82,17 +90,10 @@ def _descriptors(
     n_rotations: int,
 ) -> Array:
     """Return the descriptor of the overlap after each turn.  (n_rotations, n_features)."""
-    P, Q = overlap.reading, overlap.reference
+    clouds, overlaps = (reading, reference), (overlap.reading, overlap.reference)
     T_read_ref = inverse(T_ref_read)
-    points = np.vstack([reading.points[P], transform(T_read_ref, reference.points[Q])])
-    normals = np.vstack([reading.normals[P], reference.normals[Q] @ T_read_ref[:3, :3].T])
-    planarity = np.concatenate([reading.planarity[P], reference.planarity[Q]])
-    cylindricality = np.concatenate([reading.cylindricality[P], reference.cylindricality[Q]])
+    turned = np.tile(np.eye(4), (n_rotations, 1, 1))
+    turned[:, :3, :3] = turns(n_rotations)
     return np.array(
-        [
-            describe_overlap(
-                points @ Rz.T, normals @ Rz.T, planarity, cylindricality, pipeline.grid
-            )
-            for Rz in turns(n_rotations)
-        ]
+        [describe_clouds(clouds, overlaps, (T, T @ T_read_ref), pipeline.grid) for T in turned]
     )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import GridConfig
 from cello3d_ros.geometry.se3 import Array
 
@@ -45,11 +47,40 @@ def describe_overlap(
     normalised histogram of unsigned normals; zeros for an empty cell.  Cells are half-open, the
     grid is centred on the origin and points outside it are ignored.  Source: Sec. IV-C and V-A.
     """
+    every = np.ones(len(points), np.bool_)
+    return _describe([(points, normals, planarity, cylindricality, every)], [np.eye(4)], grid)
+
+
+def describe_clouds(
+    clouds: Sequence[Cloud],
+    overlaps: Sequence[NDArray[np.bool_]],
+    Ts: Sequence[Array],
+    grid: GridConfig,
+) -> Array:
+    """Return the same of those points of some clouds that overlap.
+
+    overlaps: (N,) of each cloud; Ts: (4, 4), each takes its cloud to the reading frame, or to a
+    turned one.
+    """
+    parts = [
+        (cloud.points, cloud.normals, cloud.planarity, cloud.cylindricality, overlap)
+        for cloud, overlap in zip(clouds, overlaps)
+    ]
+    return _describe(parts, Ts, grid)
+
+
+def _describe(
+    parts: Sequence[tuple[Array, Array, Array, Array, NDArray[np.bool_]]],
+    Ts: Sequence[Array],
+    grid: GridConfig,
+) -> Array:
     n_cells = np.array(grid.n_cells)
     extent = np.array(grid.extent_m)
     sums = np.zeros((int(n_cells.prod()), N_CELL))
     counts = np.zeros(len(sums))
-    _sum_cells(points, normals, planarity, cylindricality, n_cells, extent, BINS, sums, counts)
+    for part, T in zip(parts, Ts):
+        T = np.array(T, np.float64, order="C")
+        _sum_cells(*part, T, n_cells, extent, BINS, sums, counts)
     return (sums / np.maximum(counts, 1.0)[:, None]).ravel()
 
 
@@ -59,27 +90,36 @@ def _sum_cells(
     normals: Array,
     planarity: Array,
     cylindricality: Array,
+    overlap: NDArray[np.bool_],
+    T: Array,
     n_cells: NDArray[np.int64],
     extent: Array,
     bins: Array,
     sums: Array,
     counts: Array,
 ) -> None:
-    """Add each point's planarity, cylindricality and nearest bin to its cell."""
+    """Add the planarity, cylindricality and nearest bin of each overlapping point to its cell."""
     for i in range(len(points)):
+        if not overlap[i]:
+            continue
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
         cell = 0
         for a in range(3):
-            place = math.floor((points[i, a] / extent[a] + 0.5) * n_cells[a])
+            moved = T[a, 0] * x + T[a, 1] * y + T[a, 2] * z + T[a, 3]
+            place = math.floor((moved / extent[a] + 0.5) * n_cells[a])
             if place < 0 or place >= n_cells[a]:
                 cell = -1
                 break
             cell = cell * n_cells[a] + place
         if cell < 0:
             continue
-        nearest, cosine = 0, -1.0
         x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+        nx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z
+        ny = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z
+        nz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z
+        nearest, cosine = 0, -1.0
         for b in range(len(bins)):
-            c = abs(x * bins[b, 0] + y * bins[b, 1] + z * bins[b, 2])
+            c = abs(nx * bins[b, 0] + ny * bins[b, 1] + nz * bins[b, 2])
             if c > cosine:
                 nearest, cosine = b, c
         counts[cell] += 1.0

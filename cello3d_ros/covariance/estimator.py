@@ -23,7 +23,8 @@ class Estimate(NamedTuple):
 
     covariance: (6, 6), reading side, ordered (u, omega), by ``method``; nearest_rho: squared
     distance of the model's nearest training example; effective_neighbors: how many examples
-    share in the model's answer; is_unknown: whether the nearest is beyond the settings' limit.
+    share in the model's answer; novelty: in [0, 1], how far from all of them beside the training
+    pairs (``Prediction``); is_unknown: whether the nearest is beyond the settings' limit.
     """
 
     registration: Registration
@@ -32,6 +33,7 @@ class Estimate(NamedTuple):
     nearest_rho: float
     effective_neighbors: float
     method: str = "model"
+    novelty: float = 0.0
     is_unknown: bool = False
 
 
@@ -45,23 +47,26 @@ def estimate(
     method: str = "model",
     settings: MethodSettings = DEFAULTS,
     registration: Registration | None = None,
+    n_threads: int = 1,
 ) -> Estimate:
     """Register two clouds and find the covariance of the result.
 
     T_init: (4, 4), the first guess of T_ref_read.  method: a name of ``METHODS``.  registration:
     the result of whoever registered the clouds (``registered_elsewhere``); ICP is then not run
-    and T_init not looked at.  A registration that reached its last iteration is returned with
-    ``converged`` False: its covariance says little.  Raises RegistrationError when ICP or the
-    method has no answer, NoOverlapError when the clouds share too little and ModelError when the
-    grid is not the model's.
+    and T_init not looked at.  n_threads changes no result.  A registration that reached its last
+    iteration is returned with ``converged`` False: its covariance says little.  Raises
+    RegistrationError when ICP or the method has no answer, NoOverlapError when the clouds share
+    too little and ModelError when the model looks at the descriptor and the grid is not the
+    model's.
     """
-    if pipeline.grid != model.pipeline.grid:
+    if model.features != "global" and pipeline.grid != model.pipeline.grid:
         raise ModelError(f"the model was trained with {model.pipeline.grid}, not {pipeline.grid}")
     if registration is None:
         registration = register(reading, reference, T_init, pipeline.icp, rng)
     if registration.reason not in ("", "max_iterations"):
         raise RegistrationError(f"ICP has no answer: {registration.reason.replace('_', ' ')}")
-    description = describe(reading, reference, registration.T_ref_read, pipeline)
+    T_ref_read = registration.T_ref_read
+    description = describe(reading, reference, T_ref_read, pipeline, n_threads=n_threads)
     pair = Pair(reading, reference, registration, description)
     prediction = predicted(pair, model)
     Y = prediction.covariance
@@ -77,6 +82,7 @@ def estimate(
         prediction.nearest_rho,
         prediction.effective_neighbors,
         method,
+        prediction.novelty,
         is_unknown,
     )
 

@@ -12,7 +12,7 @@ from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import sampled_covariance, symmetrized
 from cello3d_ros.geometry.se3 import Array
 
-PRIOR_WEIGHT = 20.0  # nu: registrations that the model is worth; chosen on validation recordings
+PRIOR_WEIGHT = 40.0  # nu: registrations that the model is worth; chosen on validation recordings
 FEWEST = 8  # registrations below which six dimensions have no covariance to speak of
 
 

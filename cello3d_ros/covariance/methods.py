@@ -17,6 +17,7 @@ from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import Pipeline
 from cello3d_ros.covariance.closed_form import censi
 from cello3d_ros.covariance.description import Description
+from cello3d_ros.covariance.features import model_inputs
 from cello3d_ros.covariance.fused import fused, monte_carlo, registrations
 from cello3d_ros.covariance.model import Model, Prediction, predict
 from cello3d_ros.covariance.sigma_points import sigma_points
@@ -198,8 +199,9 @@ def mean_example(model: Model) -> Array:
 
 def predicted(pair: Pair, model: Model) -> Prediction:
     """Return the model's answer with the evidence for it."""
-    description = pair.description
-    return predict(model, description.descriptors[0], description.shapes.get(model.shape))
+    found = pair.description
+    inputs = model_inputs(model.features, found.descriptors, found.features)
+    return predict(model, inputs[0], found.shapes.get(model.shape))
 
 
 def _online(

@@ -1,4 +1,4 @@
-"""The learned model: from a pair's descriptor, and its cheap shape, to a covariance.
+"""The learned model: from what describes a pair, and its cheap shape, to a covariance.
 
 ``F(d) = sum_k w_k Y_k`` with ``w_k`` proportional to ``exp(-rho_k)`` and
 ``rho_k = |Theta (d - d_k)|^2`` over the training examples (d_k, Y_k); a share of the training mean
@@ -31,6 +31,7 @@ from cello3d_ros.config import (
     pipeline_of,
 )
 from cello3d_ros.covariance.archive import read_arrays, write_arrays
+from cello3d_ros.covariance.features import KINDS
 from cello3d_ros.covariance.sums import squared_distances, weighted_sum
 from cello3d_ros.errors import ConfigError, ModelError
 from cello3d_ros.geometry.gaussian import is_positive_definite, matrix_sqrt, symmetrized
@@ -38,28 +39,36 @@ from cello3d_ros.geometry.packed import pack, unpack
 from cello3d_ros.geometry.se3 import Array
 
 FORMAT = "cello3d-model"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 CONVENTIONS = {
     "order": "u omega",
     "side": "reading: T_hat = T_mean exp(xi)",
     "relative": "S^-1/2 Y S^-1/2, symmetric root",
     "weight": "exp(-|Theta (d - d_k)|^2)",
 }
+SHIPPED = ("general", "structured", "semi_structured", "unstructured")
 SHAPES = ("none", "hessian", "sandwich")
 
 _MAX_HEADER_BYTES = 16 * 1024**2
 _BLOCK = 65536  # covariances checked at once, bounds memory
-_ARRAYS = ("theta", "mean", "scale", "projections", "covariances")
+_ARRAYS = (
+    *("theta", "mean", "scale", "projections", "covariances"),
+    *("rho_quantiles", "neighbors_quantiles"),
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
     """Theta and the training examples, with the settings they were made with.
 
-    theta: (r, D).  mean, scale: (D,), scaler of the descriptors, ``(d - mean) / scale``.
-    projections: (N, r), Theta applied to the standardised training descriptors.
+    theta: (r, D).  mean, scale: (D,), scaler of the inputs, ``(d - mean) / scale``.
+    projections: (N, r), Theta applied to the standardised training inputs.
     covariances: (N, 6, 6), of the sampled registrations; ``S^-1/2 Y S^-1/2`` unless shape is none.
     shape: what they are relative to.  mean_weight: share of their mean in every prediction.
+    margin: factor on every prediction, for what the training data leave out.
+    features: what the inputs are, one of ``features.KINDS``.
+    rho_quantiles, neighbors_quantiles: (Q,) or empty, evenly spaced quantiles of the nearest rho
+    and of the effective neighbours of the training pairs, each seen from other recordings.
     cutoff_rho: examples with ``rho - min(rho)`` beyond this weigh nothing; inf is no cut-off.
     provenance: recordings, seeds, versions, settings, figures; anything that JSON can hold.
     Raises ModelError naming what does not fit.  The arrays are read-only.
@@ -70,8 +79,12 @@ class Model:
     scale: Array
     projections: Array
     covariances: Array
+    rho_quantiles: Array = field(default_factory=lambda: np.zeros(0))
+    neighbors_quantiles: Array = field(default_factory=lambda: np.zeros(0))
     shape: str = "none"
+    features: str = "descriptor"
     mean_weight: float = 0.0
+    margin: float = 1.0
     cutoff_rho: float = math.inf
     pipeline: Pipeline = field(default_factory=Pipeline)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -83,7 +96,7 @@ class Model:
         object.__setattr__(self, "provenance", _as_json(self.provenance))
         _check_extents(self)
         _check_settings(self)
-        for name in ("mean_weight", "cutoff_rho"):
+        for name in ("mean_weight", "margin", "cutoff_rho"):
             object.__setattr__(self, name, _number(name, getattr(self, name)))
         for start in range(0, len(self.covariances), _BLOCK):
             fine = is_positive_definite(self.covariances[start : start + _BLOCK])
@@ -97,7 +110,7 @@ class Model:
 
     @property
     def n_features(self) -> int:
-        """Length of a descriptor D."""
+        """Number of inputs D."""
         return int(self.theta.shape[1])
 
     @cached_property
@@ -116,19 +129,22 @@ class Prediction(NamedTuple):
 
     covariance: (6, 6), ordered (u, omega), reading side, exactly symmetric, positive definite.
     nearest_rho: distance of the nearest example.  effective_neighbors: ``1 / sum w_k^2``.
+    novelty: share of the training pairs that had, among other recordings, a nearer example: 1 is
+    farther than any; 0 where the model does not know.
     """
 
     covariance: Array
     nearest_rho: float
     effective_neighbors: float
+    novelty: float
 
 
-def project(descriptors: ArrayLike, theta: Array, mean: Array, scale: Array) -> Array:
+def project(inputs: ArrayLike, theta: Array, mean: Array, scale: Array) -> Array:
     """Return ``Theta (d - mean) / scale``, a point whose squared distances are rho.
 
-    descriptors: (..., D).  Returns (..., r).
+    inputs: (..., D).  Returns (..., r).
     """
-    d = np.asarray(descriptors, dtype=np.float64)
+    d = np.asarray(inputs, dtype=np.float64)
     return np.asarray(((d - mean) / scale) @ theta.T)
 
 
@@ -145,25 +161,31 @@ def weigh(rho: Array, cutoff_rho: float = math.inf) -> Array:
     return np.asarray(w)
 
 
-def predict(model: Model, descriptor: ArrayLike, S: ArrayLike | None = None) -> Prediction:
-    """Return ``F = S^1/2 [(1 - a) sum_k w_k Y_k + a mean(Y)] S^1/2``, a the mean's weight.
+def predict(model: Model, inputs: ArrayLike, S: ArrayLike | None = None) -> Prediction:
+    """Return ``F = m S^1/2 [(1 - a) sum_k w_k Y_k + a mean(Y)] S^1/2``.
 
-    descriptor: (D,).  S: (6, 6), the pair's shape that ``model.shape`` names, reading side; not
-    looked at when that is none.  Raises ModelError where either does not fit the model.
+    m is the model's margin, a the mean's weight.
+
+    inputs: (D,), what ``model_inputs`` gives.  S: (6, 6), the pair's shape that ``model.shape``
+    names, reading side; not looked at when that is none.  Raises ModelError where either does
+    not fit the model.
     """
-    d = np.asarray(descriptor, dtype=np.float64)
+    d = np.asarray(inputs, dtype=np.float64)
     if d.shape != (model.n_features,):
-        raise ModelError(f"descriptor has shape {d.shape}, the model needs ({model.n_features},)")
+        raise ModelError(
+            f"the {model.features} input has shape {d.shape}, the model needs "
+            f"({model.n_features},)"
+        )
     if not np.isfinite(d).all():
-        raise ModelError("descriptor is not finite")
+        raise ModelError(f"the {model.features} input is not finite")
     rho = squared_distances(model.projections, project(d, model.theta, model.mean, model.scale))
     if not np.isfinite(nearest := float(rho.min())):
-        raise ModelError("descriptor is too far from every example for a distance")
+        raise ModelError("the pair is too far from every example for a distance")
     w = weigh(rho, model.cutoff_rho)
     F = unpack(weighted_sum(w, model.packed_covariances))
     F = (1.0 - model.mean_weight) * F + model.mean_weight * model.mean_covariance
-    F = _scaled(F, S, model.shape)
-    return Prediction(F, nearest, float(1.0 / (w @ w)))
+    F = _scaled(model.margin * F, S, model.shape)
+    return Prediction(F, nearest, float(1.0 / (w @ w)), _rank(nearest, model.rho_quantiles))
 
 
 def constant_model(covariance: ArrayLike, n_features: int, **settings: Any) -> Model:
@@ -203,7 +225,9 @@ def load_model(path: Path | str) -> Model:
         return Model(
             **arrays,
             shape=header["shape"],
+            features=header["features"],
             mean_weight=header["mean_weight"],
+            margin=header["margin"],
             cutoff_rho=math.inf if cutoff is None else cutoff,
             pipeline=pipeline_of(config),
             sampling=config.sampling,
@@ -213,9 +237,16 @@ def load_model(path: Path | str) -> Model:
         raise ModelError(f"{path}: {error}") from None
 
 
-def shipped_model_path() -> Path:
-    """Return the path of the model that comes with the package."""
-    return Path(str(importlib.resources.files("cello3d_ros").joinpath("models", "general.npz")))
+def shipped_model_path(name: str = "general") -> Path:
+    """Return the path of a model that comes with the package: one of ``SHIPPED``."""
+    return Path(str(importlib.resources.files("cello3d_ros").joinpath("models", f"{name}.npz")))
+
+
+def find_model(word: str | Path) -> Path:
+    """Return the path that a user means: a shipped model's name, a file, nothing for general."""
+    return (
+        shipped_model_path(str(word) or "general") if str(word) in ("", *SHIPPED) else Path(word)
+    )
 
 
 def _header(model: Model) -> dict[str, Any]:
@@ -227,7 +258,9 @@ def _header(model: Model) -> dict[str, Any]:
         "conventions": CONVENTIONS,
         "config": {name: config[name] for name in (*PIPELINE, "sampling")},
         "shape": model.shape,
+        "features": model.features,
         "mean_weight": model.mean_weight,
+        "margin": model.margin,
         "cutoff_rho": None if math.isinf(model.cutoff_rho) else model.cutoff_rho,
         "provenance": model.provenance,
     }
@@ -284,6 +317,13 @@ def _scaled(F: Array, S: ArrayLike | None, shape: str) -> Array:
     return F
 
 
+def _rank(value: float, quantiles: Array) -> float:
+    """Return the share of what the quantiles are of that is below the value; 0 without any."""
+    if len(quantiles) == 0:
+        return 0.0
+    return float(np.interp(value, quantiles, np.linspace(0.0, 1.0, len(quantiles))))
+
+
 def _frozen(name: str, value: ArrayLike) -> Array:
     """Return a read-only float64 view, and a copy only where one is needed."""
     try:
@@ -322,6 +362,9 @@ def _check_extents(model: Model) -> None:
         "projections": (N, r),
         "covariances": (N, 6, 6),
     }
+    for name in ("rho_quantiles", "neighbors_quantiles"):
+        if (quantiles := getattr(model, name)).ndim != 1 or (np.diff(quantiles) < 0.0).any():
+            raise ModelError(f"{name} are not ascending numbers")
     for name, extents in wanted.items():
         if (found := getattr(model, name).shape) != extents:
             raise ModelError(f"{name} has shape {found}, expected {extents}")
@@ -333,8 +376,12 @@ def _check_settings(model: Model) -> None:
         raise ModelError("scale is not positive")
     if model.shape not in SHAPES:
         raise ModelError(f"shape must be one of {', '.join(SHAPES)}: {model.shape!r}")
+    if model.features not in KINDS:
+        raise ModelError(f"features must be one of {', '.join(KINDS)}: {model.features!r}")
     if not 0.0 <= _number("mean_weight", model.mean_weight) <= 1.0:
         raise ModelError(f"mean_weight must be in [0, 1]: {model.mean_weight!r}")
+    if not 0.0 < _number("margin", model.margin) < math.inf:
+        raise ModelError(f"margin must be positive and finite: {model.margin!r}")
     if not _number("cutoff_rho", model.cutoff_rho) >= 0.0:
         raise ModelError(f"cutoff_rho must not be negative: {model.cutoff_rho!r}")
 

@@ -23,6 +23,7 @@ from cello3d_ros.learning.sampling import (
     PENDING,
     Block,
     Prepared,
+    both_echoes,
     check_complete,
     describe_prepared,
     finish_pair,
@@ -32,6 +33,8 @@ from cello3d_ros.learning.sampling import (
 )
 from cello3d_ros.recordings import open_recording
 from cello3d_ros.recordings.recording import Scan
+from cello3d_ros.recordings.rescan import rescannable
+from cello3d_ros.recordings.scanner import Echoes
 
 _REMEMBERED = 8  # scans that a worker keeps behind the one it has read last
 
@@ -80,11 +83,13 @@ def registered(
     """Task: some registrations of a pair, none of a pair that is rejected already."""
     _one_blas_thread()
     _check_versions(job.versions)
-    Q, P = _owned(reference)[0], _owned(reading)[0]
+    reference, reading = _owned(reference), _owned(reading)
+    Q, P = reference.cloud, reading.cloud
     if record.reason != PENDING or isinstance(P, CloudError) or isinstance(Q, CloudError):
         return None
     record = replace(record, T_mean=np.array(record.T_mean, order="C"))
-    return register_block(record, P, Q, job.pipeline, job.sampling, start, stop)
+    echoes = both_echoes(reference, reading)
+    return register_block(record, P, Q, job.pipeline, job.sampling, start, stop, echoes=echoes)
 
 
 def finished_pair(job: Job, record: PairRecord, blocks: list[Block | None]) -> PairRecord:
@@ -109,12 +114,15 @@ def _owned(scan: Prepared) -> Prepared:
     Those are read-only views of a message, aligned to no multiple of anything: every kernel would
     be compiled again for them, and numpy multiplies them in another way, to other last bits.
     """
-    cloud, T_world_sensor = scan
+    cloud, T_world_sensor, echoes = scan
     if isinstance(cloud, CloudError) or cloud.points.flags.writeable:
         return scan
     tree = KdTree._make(np.array(array) for array in cloud.tree)
     arrays = {name: np.array(getattr(cloud, name)) for name in Cloud._fields if name != "tree"}
-    return cloud._replace(tree=tree, **arrays), np.array(T_world_sensor, order="C")
+    if echoes is not None:
+        echoes = Echoes(echoes.scanner, np.array(echoes.distances), np.array(echoes.cosines))
+    cloud = cloud._replace(tree=tree, **arrays)
+    return Prepared(cloud, np.array(T_world_sensor, order="C"), echoes)
 
 
 class _Reader:
@@ -124,8 +132,8 @@ class _Reader:
     after the death of another worker, starts over.
     """
 
-    def __init__(self, path: str) -> None:
-        self._recording = open_recording(path)
+    def __init__(self, path: str, rescan: bool = False) -> None:
+        self._recording = rescannable(path) if rescan else open_recording(path)
         self._scans = iter(self._recording)
         self._n_read = 0
         self._recent: dict[int, Scan] = {}
@@ -153,7 +161,7 @@ def _read(job: Job, index: int) -> Scan:
     """Return a scan of the recording that this worker has open, which is one at a time."""
     key = (job.run, job.path)
     with _reading:
-        reader = _readers.pop(key, None) or _Reader(job.path)
+        reader = _readers.pop(key, None) or _Reader(job.path, job.sampling.noise_m > 0.0)
         scan = reader.scan(index)  # a reader that fails is not kept
         _readers.clear()
         _readers[key] = reader

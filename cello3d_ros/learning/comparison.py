@@ -20,6 +20,7 @@ from cello3d_ros.learning.evaluation import best_scale, figures, select
 from cello3d_ros.learning.examples import (
     Examples,
     load_examples,
+    select_inputs,
     to_absolute,
     unturned_rows,
 )
@@ -49,24 +50,27 @@ def seen_recordings(model: Model) -> set[str]:
     return seen
 
 
-def training_mean(model: Model, datasets: Sequence[Dataset]) -> Array:
-    """Return the mean of the covariances that the model was trained on.  (6, 6).
+def training_mean(model: Model) -> Array:
+    """Return the mean of the covariances that the model was trained on, as it keeps it.  (6, 6).
 
-    A model of absolute covariances holds it; for a relative one the training recordings must be
-    in the datasets.  Raises DatasetError naming one that is not.
+    Raises DatasetError where it keeps none.
     """
     if model.shape == "none":
         return mean_example(model)
-    training = model.provenance.get("recordings", {})
-    present = {key[0] for dataset in datasets for key in dataset.pair_keys()}
-    missing = sorted(set(training) - present)
-    if missing or not training:
-        what = f"recording {missing[0]!r}" if missing else "any recording"
+    try:
+        mean = np.array(model.provenance["mean_covariance"], np.float64).reshape(6, 6)
+    except (KeyError, TypeError, ValueError):
         raise DatasetError(
-            f"the mean of the training covariances is the baseline, and no dataset holds {what} "
-            "that the model was trained on; name one by --baseline"
-        )
-    return np.asarray(load_examples(datasets, training).covariances.mean(axis=0))
+            "the mean of the training covariances is the baseline, and the model does not keep "
+            "it; name datasets whose mean to take by --baseline"
+        ) from None
+    return mean
+
+
+def mean_of(datasets: Sequence[Dataset]) -> Array:
+    """Return the mean of the covariances of all accepted pairs.  (6, 6)."""
+    names = {key[0] for dataset in datasets for key in dataset.pair_keys()}
+    return np.asarray(load_examples(datasets, names).covariances.mean(axis=0))
 
 
 def from_dataset(
@@ -77,8 +81,12 @@ def from_dataset(
     mean: (6, 6), the baseline.  Raises DatasetError where the dataset's settings are not the
     model's: its descriptors would not be comparable.
     """
-    if found := differences(examples.pipeline, model.pipeline):
+    found = differences(examples.pipeline, model.pipeline)
+    if model.features == "global":
+        found = [difference for difference in found if not difference.startswith("grid.")]
+    if found:
         raise DatasetError(f"the dataset does not go with the model: {found[0]}")
+    examples = select_inputs(examples, model.features)
     if model.shape != "none" and model.shape not in examples.shapes:
         raise DatasetError(f"the dataset does not hold the {model.shape} of each pair")
     n = len(examples.covariances)

@@ -25,11 +25,12 @@ from numpy.typing import NDArray
 
 from cello3d_ros.config import Pipeline, SamplingConfig, config_from, config_to, pipeline_of
 from cello3d_ros.covariance.archive import read_arrays, write_arrays
+from cello3d_ros.covariance.features import FEATURES
 from cello3d_ros.errors import ConfigError, DatasetError, ModelError
 from cello3d_ros.geometry.gaussian import is_positive_definite
 from cello3d_ros.geometry.se3 import Array
 
-FORMAT = 1
+FORMAT = 2
 CONVENTIONS = (
     "T_ref_read maps reading points into the reference frame; xi = (u, omega) = "
     "log(inverse(T_mean) T_hat); covariances about ground truth, on the reading side"
@@ -41,6 +42,7 @@ _ARRAYS = {
     "kept": "|b1",
     "covariance": "<f8",
     "descriptors": "<f4",
+    "features": "<f8",
     "rotations_rad": "<f8",
 }
 _HEADER = ("recording", "i", "j", "accepted", "reason", "n_converged", "n_failed", "overlap_ratio")
@@ -52,8 +54,9 @@ class PairRecord:
     """What brute force found out about one pair; a rejected pair leaves out what it lacks.
 
     ``kept`` says which of ``xi`` made the covariance Y, about ground truth, reading side.
-    ``descriptors[r]`` and, by adjoints, the covariance describe the pair turned about z of the
-    reading frame by ``rotations_rad[r]``; ``covariance`` and ``shapes`` themselves are not turned.
+    ``features`` are those that ``FEATURES`` names.  ``descriptors[r]`` and, by adjoints, the
+    covariance describe the pair turned about z of the reading frame by ``rotations_rad[r]``;
+    ``covariance`` and ``shapes`` themselves are not turned.
     """
 
     recording: str
@@ -70,6 +73,7 @@ class PairRecord:
     descriptors: NDArray[np.float32] = field(  # (n_rotations, D)
         default_factory=lambda: np.zeros((0, 0), np.float32)
     )
+    features: Array = field(default_factory=lambda: np.zeros(0))  # (len(FEATURES),)
     rotations_rad: Array = field(default_factory=lambda: np.zeros(0))  # (n_rotations,)
     shapes: dict[str, Array] = field(default_factory=dict)  # "hessian", "sandwich": (6, 6)
     overlap_ratio: float = 0.0
@@ -227,6 +231,7 @@ def _begin(path: Path, pipeline: Pipeline, sampling: SamplingConfig) -> None:
     manifest = {
         "format": FORMAT,
         "conventions": CONVENTIONS,
+        "features": list(FEATURES),
         "configuration": _configuration(pipeline, sampling),
         "versions": package_versions(),
         "recordings": {},
@@ -259,7 +264,10 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise DatasetError(f"cannot read {file}: {error}") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         found = manifest.get("format") if isinstance(manifest, dict) else manifest
-        raise DatasetError(f"{file} has format {found!r}, this version reads {FORMAT}")
+        hint = ": sample it again, it lacks the global features" if found == 1 else ""
+        raise DatasetError(f"{file} has format {found!r}, this version reads {FORMAT}{hint}")
+    if manifest.get("features") != list(FEATURES):
+        raise DatasetError(f"{file} lists other global features than this version: sample again")
     for name in ("configuration", "versions", "recordings"):
         if not isinstance(manifest.get(name), dict):
             raise DatasetError(f"{file} lacks {name!r}")
@@ -321,6 +329,8 @@ def _check(record: PairRecord) -> None:
     shape, n_rotations = record.descriptors.shape, len(record.rotations_rad)
     if n_rotations == 0 or len(shape) != 2 or shape[0] != n_rotations or shape[1] == 0:
         raise ValueError(f"{n_rotations} rotations, descriptors {shape}")
+    if record.features.shape != (len(FEATURES),):
+        raise ValueError(f"{record.features.size} global features, not {len(FEATURES)}")
     for name, Y in {"covariance": record.covariance, **record.shapes}.items():
         if Y.shape != (6, 6) or not is_positive_definite(Y):
             raise ValueError(f"{name} is not a positive definite 6x6 matrix")

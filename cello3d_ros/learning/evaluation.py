@@ -42,7 +42,7 @@ def evaluate(
     )
     constant = np.array([relative_means[name] for name in targets.groups])
     F = {
-        "model": to_absolute(predicted(theta, problem), targets, config.shape),
+        "model": to_absolute(config.margin * predicted(theta, problem), targets, config.shape),
         "mean_covariance": np.array([absolute_means[name] for name in targets.groups]),
         "constant": to_absolute(constant, targets, config.shape),
     }
@@ -141,6 +141,7 @@ def select(examples: Examples, keep: NDArray[np.bool_]) -> Examples:
     return dataclasses.replace(
         examples,
         features=examples.features[keep],
+        global_features=examples.global_features[keep[: len(examples.global_features)]],
         covariances=examples.covariances[keep],
         groups=examples.groups[keep],
         shapes={name: S[keep] for name, S in examples.shapes.items()},

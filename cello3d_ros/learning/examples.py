@@ -6,11 +6,13 @@ import dataclasses
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.config import Pipeline, SamplingConfig, differences
+from cello3d_ros.covariance.features import model_inputs
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.geometry.gaussian import matrix_inverse_sqrt, matrix_sqrt, symmetrized
 from cello3d_ros.geometry.se3 import Array, adjoint, exp
@@ -27,16 +29,18 @@ _MAX_SAMPLES = 200  # errors of each pair kept for the coverage
 class Examples:
     """Accepted pairs of some recordings; nothing is relative or turned yet but the features.
 
-    features: (N, n_rotations, D) descriptors of the pair turned about z by ``rotations_rad``.
+    features: (N, n_rotations, D) descriptors of the pair turned about z by ``rotations_rad``;
+    after ``select_inputs`` what a model looks at.  global_features: (N, G).
     covariances: (N, 6, 6).  groups: (N,) names of recordings.  shapes: name -> (N, 6, 6).
     xi: N arrays (n, 6), some of the errors that made each covariance.
     """
 
-    features: NDArray[np.float32]
+    features: NDArray[np.floating[Any]]
     covariances: Array
     groups: NDArray[np.str_]
     shapes: dict[str, Array]
     rotations_rad: Array
+    global_features: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
     xi: tuple[Array, ...] = ()
     rejected: dict[str, int] = dataclasses.field(default_factory=dict)  # reason -> pairs
     pipeline: Pipeline = dataclasses.field(default_factory=Pipeline)
@@ -65,6 +69,16 @@ def load_examples(datasets: Sequence[Dataset], recordings: Iterable[str]) -> Exa
                     raise DatasetError(f"{dataset.path} repeats the pair {key} of another dataset")
                 records[key] = _slim(dataset.read(*key))
     return _stacked([records[key] for key in sorted(records)], datasets[0])
+
+
+def select_inputs(examples: Examples, kind: str) -> Examples:
+    """Return the examples with what a model of ``kind`` looks at as their features."""
+    if kind == "descriptor":
+        return examples
+    first = unturned_rows(examples).start
+    descriptors = examples.features[:, first:].astype(np.float64)
+    inputs = model_inputs(kind, descriptors, examples.global_features)
+    return dataclasses.replace(examples, features=inputs, rotations_rad=np.zeros(1))
 
 
 def to_relative(examples: Examples, shape: str) -> Array:
@@ -153,6 +167,7 @@ def _stacked(records: list[PairRecord], dataset: Dataset) -> Examples:
     return Examples(
         features=np.array([record.descriptors for record in accepted]),
         covariances=np.array([record.covariance for record in accepted]),
+        global_features=np.array([record.features for record in accepted]),
         groups=np.array([record.recording for record in accepted]),
         shapes={n: np.array([record.shapes[n] for record in accepted]) for n in sorted(names)},
         rotations_rad=first.rotations_rad,

@@ -156,6 +156,19 @@ def predicted(theta: Array, problem: Problem) -> Array:
     )
 
 
+def evidence(theta: Array, problem: Problem) -> tuple[Array, Array]:
+    """Return each target's nearest rho and effective neighbours ``1 / sum s^2``.  (K,), (K,)."""
+    P_examples = _projected(problem.X_examples, theta)
+    nearest, neighbors = [], []
+    for block in _blocks(len(problem.X)):
+        P = _projected(problem.X[block], theta)
+        s = _weights(P, P_examples, problem, block)
+        offset = P - P_examples[s.argmax(axis=1)]
+        nearest.append(np.einsum("kr,kr->k", offset, offset))
+        neighbors.append(1.0 / np.einsum("kj,kj->k", s, s))
+    return np.concatenate(nearest), np.concatenate(neighbors)
+
+
 def pair_losses(F: Array, Y: Array, loss: str) -> tuple[Array, Array]:
     """Return the loss of each prediction and its derivative by F.  (K,), (K, 6, 6)."""
     L = np.linalg.cholesky(F)

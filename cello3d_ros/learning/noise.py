@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from cello3d_ros.clouds.filters import subsample
 from cello3d_ros.clouds.neighbors import build_tree
-from cello3d_ros.clouds.shape import Cloud
-from cello3d_ros.config import IcpConfig
+from cello3d_ros.clouds.shape import Cloud, prepare
+from cello3d_ros.config import IcpConfig, Pipeline
+from cello3d_ros.errors import CloudError
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.recordings.scanner import Echoes, measure
 from cello3d_ros.registration.backends import in_threads, register
 from cello3d_ros.registration.icp import Registration
 
@@ -40,6 +42,35 @@ def register_many_noisy(
         ref = subsample(len(reference.points), config.n_reference_points, rng)
         P, Q = noisy(reading, read, sigma_m, rng), noisy(reference, ref, sigma_m, rng)
         return register(P, Q, T_inits[k], config, rng)
+
+    return in_threads(one, len(T_inits), n_threads)
+
+
+def register_many_rescanned(
+    reference: Echoes,
+    reading: Echoes,
+    T_inits: Array,
+    seeds: Sequence[Sequence[int]],
+    pipeline: Pipeline,
+    sigma_m: float,
+    n_threads: int = 1,
+) -> list[Registration]:
+    """Register from many starts, each with both clouds scanned and prepared anew.
+
+    Ranges, missing returns, filters, normals and subsamples are those of this registration alone.
+    A scan that leaves no cloud gives the start, with the reason "too_few_points".
+    """
+
+    def one(k: int) -> Registration:
+        rng = np.random.default_rng(seeds[k])
+        try:
+            P, Q = (
+                prepare(measure(echoes, rng, sigma_m), pipeline.cloud, rng)
+                for echoes in (reading, reference)
+            )
+        except CloudError:
+            return Registration(T_inits[k], 0, False, "too_few_points", np.inf, 0)
+        return register(P, Q, T_inits[k], pipeline.icp, rng)
 
     return in_threads(one, len(T_inits), n_threads)
 

@@ -24,9 +24,10 @@ from cello3d_ros.geometry.gaussian import is_positive_definite, sampled_covarian
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log
 from cello3d_ros.learning.clustering import nearest_cluster, offset
 from cello3d_ros.learning.dataset import PairRecord
-from cello3d_ros.learning.noise import register_many_noisy
+from cello3d_ros.learning.noise import register_many_noisy, register_many_rescanned
 from cello3d_ros.learning.precision import eigenvalue_errors
 from cello3d_ros.recordings.recording import Recording, Scan
+from cello3d_ros.recordings.scanner import Echoes
 from cello3d_ros.registration.backends import register, register_many
 
 PENDING = "not_sampled"  # the reason of a record that is described and no more
@@ -34,8 +35,15 @@ BLOCK = 500  # registrations between two reports of progress
 _GROWTH = 1.25  # of the number of samples from one look at the precision to the next
 _FEWEST_KEPT = 12  # twice the dimensions: fewer make no covariance worth learning
 
-Prepared = tuple[Cloud | CloudError, Array]  # a scan's cloud, or why it has none; its true pose
 Progress = Callable[[int], None]  # told how many registrations were done since the last call
+
+
+class Prepared(NamedTuple):
+    """A scan's cloud, or why it has none; its true pose; if wanted, how to scan it again."""
+
+    cloud: Cloud | CloudError
+    T_world_sensor: Array
+    echoes: Echoes | None = None
 
 
 class Block(NamedTuple):
@@ -94,10 +102,12 @@ def sample_prepared(
 ) -> PairRecord:
     """Sample one pair of prepared scans; a scan without a cloud makes a rejected pair."""
     T_mean = _between(reference, reading)
-    if isinstance(reference[0], CloudError) or isinstance(reading[0], CloudError):
+    P, Q = reading.cloud, reference.cloud
+    if isinstance(P, CloudError) or isinstance(Q, CloudError):
         return _without_cloud(recording, i, j, T_mean)
+    echoes = both_echoes(reference, reading)
     return sample_pair(
-        recording, i, j, reading[0], reference[0], T_mean, pipeline, sampling, n_threads, progress
+        recording, i, j, P, Q, T_mean, pipeline, sampling, n_threads, progress, echoes
     )
 
 
@@ -112,9 +122,10 @@ def describe_prepared(
 ) -> PairRecord:
     """Describe one pair of prepared scans as ``describe_pair`` does."""
     T_mean = _between(reference, reading)
-    if isinstance(reference[0], CloudError) or isinstance(reading[0], CloudError):
+    P, Q = reading.cloud, reference.cloud
+    if isinstance(P, CloudError) or isinstance(Q, CloudError):
         return _without_cloud(recording, i, j, T_mean)
-    return describe_pair(recording, i, j, reading[0], reference[0], T_mean, pipeline, sampling)
+    return describe_pair(recording, i, j, P, Q, T_mean, pipeline, sampling)
 
 
 def sample_pair(
@@ -128,11 +139,13 @@ def sample_pair(
     sampling: SamplingConfig,
     n_threads: int = 1,
     progress: Progress = lambda n: None,
+    echoes: tuple[Echoes, Echoes] | None = None,
 ) -> PairRecord:
     """Register one pair many times and take the covariance about ground truth.
 
     T_mean: (4, 4), true T_ref_read.  Each start is ``T_mean exp(xi)``, xi ~ N(0, variance I), and
-    each registration draws its own subsamples.  There are ``n_samples`` of them, or fewer where
+    each registration draws its own subsamples; with ``noise_m`` also noise, or where there are
+    echoes (reference, reading), two new scans.  There are ``n_samples`` of them, or fewer where
     ``precision`` is reached before: the record is then that of the smaller ``n_samples``.
     Source: Sec. IV-D, V-A.
     """
@@ -142,7 +155,9 @@ def sample_pair(
     blocks: list[Block] = []
     for start, stop in pairwise([0, *stops(sampling)]):
         blocks.append(
-            register_block(record, reading, reference, pipeline, sampling, start, stop, n_threads)
+            register_block(
+                record, reading, reference, pipeline, sampling, start, stop, n_threads, echoes
+            )
         )
         progress(stop - start)
         if sampling.precision > 0.0 and stop < sampling.n_samples:
@@ -189,6 +204,7 @@ def describe_pair(
         base,
         overlap_ratio=pair.overlap_ratio,
         descriptors=pair.descriptors.astype(np.float32),
+        features=pair.features,
         rotations_rad=2.0 * np.pi * np.arange(sampling.n_rotations) / sampling.n_rotations,
         shapes=pair.shapes,
     )
@@ -203,6 +219,7 @@ def register_block(
     start: int,
     stop: int,
     n_threads: int = 1,
+    echoes: tuple[Echoes, Echoes] | None = None,
 ) -> Block:
     """Do the registrations ``start`` to ``stop - 1`` of a described pair.
 
@@ -214,7 +231,11 @@ def register_block(
     )[start:]
     T_inits = T_mean @ exp(starts)
     seeds = [[*seed, 1, k] for k in range(start, stop)]
-    if sampling.noise_m > 0.0:
+    if sampling.noise_m > 0.0 and echoes is not None:
+        results = register_many_rescanned(
+            *echoes, T_inits, seeds, pipeline, sampling.noise_m, n_threads
+        )
+    elif sampling.noise_m > 0.0:
         results = register_many_noisy(
             reading, reference, T_inits, seeds, pipeline.icp, sampling.noise_m, n_threads
         )
@@ -279,16 +300,25 @@ def prepare_scan(
 ) -> Prepared:
     """Return the cloud of scan ``index`` of a recording, or why it has none, and its true pose.
 
-    Raises RecordingError when it has no true pose.
+    Its echoes are kept where registrations are to scan it again.  Raises RecordingError when it
+    has no true pose.
     """
     if scan.T_world_sensor is None:
         raise RecordingError(f"{name}: scan {index} has no ground truth, sampling needs it")
     rng = np.random.default_rng([sampling.seed, _name_seed(name), index])
     T_world_sensor = np.array(scan.T_world_sensor, order="C")
     try:
-        return prepare(scan.points, pipeline.cloud, rng), T_world_sensor
+        cloud = prepare(scan.points, pipeline.cloud, rng)
     except CloudError as error:
-        return error, T_world_sensor
+        return Prepared(error, T_world_sensor)
+    return Prepared(cloud, T_world_sensor, scan.echoes if sampling.noise_m > 0.0 else None)
+
+
+def both_echoes(reference: Prepared, reading: Prepared) -> tuple[Echoes, Echoes] | None:
+    """Return the echoes of both scans, or None where one cannot be scanned again."""
+    if reference.echoes is None or reading.echoes is None:
+        return None
+    return reference.echoes, reading.echoes
 
 
 def check_complete(name: str, n_read: int, needed: set[int]) -> None:
@@ -300,7 +330,7 @@ def check_complete(name: str, n_read: int, needed: set[int]) -> None:
 
 
 def _between(reference: Prepared, reading: Prepared) -> Array:
-    return np.ascontiguousarray(inverse(reference[1]) @ reading[1])
+    return np.ascontiguousarray(inverse(reference.T_world_sensor) @ reading.T_world_sensor)
 
 
 def _without_cloud(recording: str, i: int, j: int, T_mean: Array) -> PairRecord:

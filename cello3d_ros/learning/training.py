@@ -20,9 +20,15 @@ from cello3d_ros.geometry.packed import unpack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import package_versions
 from cello3d_ros.learning.evaluation import Figures, evaluate
-from cello3d_ros.learning.examples import Examples, feature_scaler, flat_features
+from cello3d_ros.learning.examples import (
+    Examples,
+    feature_scaler,
+    flat_features,
+    select_inputs,
+)
 from cello3d_ros.learning.loss import (
     Problem,
+    evidence,
     expand_features,
     leave_out_problem,
     loss_and_gradient,
@@ -36,6 +42,7 @@ from cello3d_ros.learning.loss import (
 
 Progress = Callable[[int, float, float], None]  # iteration, training loss, what Theta is judged by
 
+_LEVELS = np.linspace(0.0, 1.0, 101)  # of the quantiles that a model keeps
 _PATIENCE = 20  # iterations without a better validation loss that end training
 _DIVERGED = 1e100  # |Theta|^2, far beyond anything and far below where numbers end
 _BATCH = 16  # targets of one stochastic gradient
@@ -72,6 +79,9 @@ def train(
     Theta = 0, the mean of the examples, takes part.  Deterministic; an interrupt (Ctrl-C) ends
     training with the best so far.  Raises DatasetError for fewer than two recordings.
     """
+    examples = select_inputs(examples, config.features)
+    if validation is not None:
+        validation = select_inputs(validation, config.features)
     _check_groups(examples, validation)
     mean, scale, active = feature_scaler(examples)
     problem = leave_out_problem(examples, config, mean, scale)
@@ -90,6 +100,7 @@ def train(
         "recordings": examples.n_pairs,
         "validation_recordings": {} if validation is None else validation.n_pairs,
         "rejected_pairs": examples.rejected,
+        "mean_covariance": examples.covariances.mean(axis=0).tolist(),
         "rotations_rad": examples.rotations_rad.tolist(),
         "training": dataclasses.asdict(config),
         "iterations": search.n_iterations,
@@ -97,6 +108,7 @@ def train(
         "figures": figures,
         "versions": package_versions(),
     }
+    nearest, neighbors = evidence(theta, problem)
     model = Model(
         theta=theta,
         mean=mean,
@@ -104,7 +116,11 @@ def train(
         projections=project(flat_features(examples), theta, mean, scale),
         covariances=unpack(problem.packed_examples),
         shape=config.shape,
+        features=config.features,
+        rho_quantiles=np.quantile(nearest, _LEVELS),
+        neighbors_quantiles=np.quantile(neighbors, _LEVELS),
         mean_weight=config.mean_weight,
+        margin=config.margin,
         pipeline=examples.pipeline,
         sampling=examples.sampling,
         provenance=provenance,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -104,7 +104,7 @@ SCANNERS = MappingProxyType(
 
 
 def raycasting_scene(mesh: Mesh) -> Any:
-    """Return Open3D's ``RaycastingScene`` of a mesh, ready for ``scan``.
+    """Return Open3D's ``RaycastingScene`` of a mesh, ready for ``cast``.
 
     Raises RecordingError where Open3D cannot be imported.
     """
@@ -117,22 +117,41 @@ def raycasting_scene(mesh: Mesh) -> Any:
     return scene
 
 
-def scan(scene: Any, scanner: Scanner, T_world_sensor: Array, rng: np.random.Generator) -> Array:
-    """Return the points (N, 3) of one scan in the sensor frame, each a float32 number.
+class Echoes(NamedTuple):
+    """What a scan's beams meet, before any error: enough to scan again without the world.
 
-    range = distance + N(0, range_noise_m^2) along the beam; a range outside the scanner's limits,
-    a grazing or a randomly missing return gives no point.
+    distances: (n,) metres along the beams, inf where there is nothing; cosines: (n,) of the angles
+    of incidence.
     """
+
+    scanner: Scanner
+    distances: Array
+    cosines: Array
+
+
+def cast(scene: Any, scanner: Scanner, T_world_sensor: Array) -> Echoes:
+    """Return what the scanner's beams meet from a pose."""
     o3d = import_open3d("simulated worlds")
     beams = scanner.directions()
     rays = np.empty((len(beams), 6), dtype=np.float32)
     rays[:, :3] = T_world_sensor[:3, 3]
     rays[:, 3:] = beams @ T_world_sensor[:3, :3].T
     hits = scene.cast_rays(o3d.core.Tensor(rays))
-    distance = hits["t_hit"].numpy().astype(np.float64)
     normal = hits["primitive_normals"].numpy().astype(np.float64)
-    cosine = np.abs(np.einsum("ij,ij->i", normal, rays[:, 3:].astype(np.float64)))
-    noise = scanner.range_noise_m * rng.normal(size=len(beams))
+    cosines = np.abs(np.einsum("ij,ij->i", normal, rays[:, 3:].astype(np.float64)))
+    return Echoes(scanner, hits["t_hit"].numpy().astype(np.float64), cosines)
+
+
+def measure(echoes: Echoes, rng: np.random.Generator, range_noise_m: float | None = None) -> Array:
+    """Return the points (N, 3) of one scan in the sensor frame, each a float32 number.
+
+    range = distance + N(0, range_noise_m^2) along the beam, the scanner's own noise if not said; a
+    range outside the scanner's limits, a grazing or a randomly missing return gives no point.
+    """
+    scanner, distance, cosine = echoes
+    sigma_m = scanner.range_noise_m if range_noise_m is None else range_noise_m
+    beams = scanner.directions()
+    noise = sigma_m * rng.normal(size=len(beams))
     luck, gloss = rng.uniform(size=(2, len(beams)))
     kept = (
         (distance + noise >= scanner.min_range_m)
@@ -142,6 +161,11 @@ def scan(scene: Any, scanner: Scanner, T_world_sensor: Array, rng: np.random.Gen
     )
     points = (distance[kept] + noise[kept])[:, None] * beams[kept]
     return np.asarray(points.astype(np.float32), dtype=np.float64)
+
+
+def scan(scene: Any, scanner: Scanner, T_world_sensor: Array, rng: np.random.Generator) -> Array:
+    """Return the points (N, 3) of one scan as ``measure`` does."""
+    return measure(cast(scene, scanner, T_world_sensor), rng)
 
 
 def import_open3d(purpose: str) -> Any:

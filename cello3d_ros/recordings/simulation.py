@@ -15,7 +15,7 @@ from cello3d_ros.recordings.odometry import PoseTrack, drift_odometry
 from cello3d_ros.recordings.paths import walk
 from cello3d_ros.recordings.poses import check_order, read_tum
 from cello3d_ros.recordings.recording import Scan
-from cello3d_ros.recordings.scanner import SCANNERS, Scanner, raycasting_scene, scan
+from cello3d_ros.recordings.scanner import SCANNERS, Scanner, cast, measure, raycasting_scene
 from cello3d_ros.recordings.tables import read_bytes
 from cello3d_ros.recordings.worlds import World, build_world
 
@@ -25,10 +25,11 @@ STEP_NS = 500_000_000
 
 @dataclass(frozen=True)
 class Simulation:
-    """A recording that is computed while it is read; all of it follows from these five.
+    """A recording that is computed while it is read; all of it follows from the first five.
 
     world: the name of a world, or a YAML file with one.  path: a TUM file with the poses of the
     sensor and their stamps, instead of a walk along the world's route with a scan each 0.5 s.
+    title: what it is called instead of by world and seed.
 
     A scan depends on the seed and on its own number only: a longer simulation starts with the
     scans of a shorter one.
@@ -39,6 +40,7 @@ class Simulation:
     n_scans: int
     scanner: Scanner = SCANNERS["spinning32"]
     path: Path | None = None
+    title: str = ""
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -48,8 +50,8 @@ class Simulation:
 
     @property
     def name(self) -> str:
-        """World and seed."""
-        return f"{Path(self.world).stem}-{self.seed}"
+        """World and seed, if it has no title."""
+        return self.title or f"{Path(self.world).stem}-{self.seed}"
 
     @property
     def n_projected(self) -> int:
@@ -63,11 +65,13 @@ class Simulation:
         world, truth, odometry = self.build()
         scene, stamps = raycasting_scene(world.mesh), self.stamps_ns()
         for k in range(self.n_scans):
+            echoes = cast(scene, self.scanner, truth[k])
             yield Scan(
                 stamp_ns=stamps[k],
-                points=scan(scene, self.scanner, truth[k], np.random.default_rng([self.seed, k])),
+                points=measure(echoes, np.random.default_rng([self.seed, k])),
                 T_world_sensor=truth[k],
                 T_odom_sensor=odometry[k],
+                echoes=echoes,
             )
 
     def track(self) -> PoseTrack:

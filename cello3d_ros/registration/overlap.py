@@ -37,18 +37,25 @@ class Overlap(NamedTuple):
 
 
 def find_overlap(
-    reading: Cloud, reference: Cloud, T_ref_read: Array, radius_m: float, k: int = 1
+    reading: Cloud,
+    reference: Cloud,
+    T_ref_read: Array,
+    radius_m: float,
+    k: int = 1,
+    n_threads: int = 1,
 ) -> Overlap:
     """Return the points of two clouds that are at most ``radius_m`` from the other cloud.
 
-    T_ref_read: (4, 4), p_ref = T_ref_read p_read.  Source: S of Sec. IV-C.
+    T_ref_read: (4, 4), p_ref = T_ref_read p_read.  A reference point that is near enough among the
+    neighbours of a reading point overlaps; the others look for a reading point themselves.
+    Source: S of Sec. IV-C.
     """
     moved = transform(T_ref_read, reading.points)
-    distances2, indices = nearest(reference.tree, moved, k)
-    back = transform(inverse(T_ref_read), reference.points)
-    return Overlap(
-        distances2[:, 0] <= radius_m**2,
-        any_within(reading.tree, back, radius_m),
-        distances2,
-        indices,
-    )
+    distances2, indices = nearest(reference.tree, moved, k, n_threads)
+    within = distances2 <= radius_m**2
+    overlaps = np.zeros(len(reference.points), np.bool_)
+    overlaps[indices[within]] = True
+    rest = np.flatnonzero(~overlaps)
+    back = transform(inverse(T_ref_read), reference.points[rest])
+    overlaps[rest] = any_within(reading.tree, back, radius_m, n_threads)
+    return Overlap(within[:, 0], overlaps, distances2, indices)

@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from sensor_msgs.msg import PointCloud2
 
 from cello3d_ros.config import NodeConfig
-from cello3d_ros.errors import ConfigError
+from cello3d_ros.ros.messages import tf_message
 
 
 class Role(Enum):
@@ -41,7 +41,7 @@ def topics(config: NodeConfig) -> list[Topic]:
     """
     found = []
     if config.use_tf:
-        kind = _tf_message()
+        kind = tf_message("node.use_tf")
         found += [
             Topic(Role.STATIC_TRANSFORMS, kind, "/tf_static", _latched(100)),
             Topic(Role.TRANSFORMS, kind, "/tf", QoSProfile(depth=100)),
@@ -69,15 +69,3 @@ def _best_effort(depth: int) -> QoSProfile:
 
 def _latched(depth: int) -> QoSProfile:
     return QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def _tf_message() -> Any:
-    """Return tf2_msgs/TFMessage, which only use_tf needs."""
-    try:
-        from tf2_msgs.msg import TFMessage
-    except ImportError:
-        raise ConfigError(
-            "parameter node.use_tf needs the package tf2_msgs (apt install ros-jazzy-tf2-msgs); "
-            "node.T_base_sensor does without"
-        ) from None
-    return TFMessage

@@ -11,6 +11,7 @@ from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2, PointField
 
+from cello3d_ros.errors import ConfigError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import to_fixed_axes
 from cello3d_ros.geometry.se3 import Array
@@ -127,6 +128,18 @@ def transform_to(stamp_ns: int, frame_id: str, child_frame_id: str, T: Array) ->
     t.x, t.y, t.z = p.x, p.y, p.z
     message.transform.rotation = pose.orientation
     return message
+
+
+def tf_message(parameter: str) -> Any:
+    """Return tf2_msgs/TFMessage, which only some parameters need.  Raises ConfigError."""
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:
+        raise ConfigError(
+            f"parameter {parameter} needs the package tf2_msgs: apt install ros-jazzy-tf2-msgs, "
+            "or leave it false"
+        ) from None
+    return TFMessage
 
 
 def _cells(covariance: Array) -> Array:

@@ -39,6 +39,7 @@ from cello3d_ros.ros.inputs import Role, Topic, topics
 from cello3d_ros.ros.intake import JUMP_NS, Job, Skip
 from cello3d_ros.ros.life import ManagedNode
 from cello3d_ros.ros.logbook import Logbook
+from cello3d_ros.ros.messages import tf_message
 from cello3d_ros.ros.outputs import Outputs
 from cello3d_ros.ros.tracker import Answer, reason_of
 from cello3d_ros.ros.warmup import warm_up
@@ -73,6 +74,8 @@ class CovarianceNode(ManagedNode):
         self._model = load_model(path)
         config = self._declared(self._model)
         topics(config.node)  # what is not installed is better missed before the warming up
+        if config.node.publish_tf:
+            tf_message("node.publish_tf")
         self.get_logger().info("warming up; a first start compiles the kernels")
         warm_up(self._model, config)
         self._statistics = Statistics(path.name)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
@@ -11,7 +9,6 @@ from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
 from cello3d_ros.config import NodeConfig
-from cello3d_ros.errors import ConfigError
 from cello3d_ros.geometry.se3 import Array, log
 from cello3d_ros.ros import messages
 from cello3d_ros.ros.covariances import twist_covariance
@@ -28,7 +25,7 @@ class Outputs:
         """Announce the topics.  Raises ConfigError when TF is asked for and not there."""
         self._node = node
         self._n_answers = 0
-        self._tf_message = _tf_message() if config.publish_tf else None
+        self._tf_message = messages.tf_message("node.publish_tf") if config.publish_tf else None
         self._relative = node.create_publisher(PoseWithCovarianceStamped, "~/relative_pose", 10)
         self._pose = node.create_publisher(PoseWithCovarianceStamped, "~/pose", 10)
         self._odometry = node.create_publisher(Odometry, "~/odometry", 10)
@@ -115,14 +112,3 @@ def _twist(answer: Answer, config: NodeConfig) -> tuple[Array, Array]:
 
 def _bounds(config: NodeConfig) -> tuple[float, float, float]:
     return config.floor_sigma_m, config.floor_sigma_rad, config.ceiling
-
-
-def _tf_message() -> Any:
-    try:
-        from tf2_msgs.msg import TFMessage
-    except ImportError:
-        raise ConfigError(
-            "parameter node.publish_tf needs tf2_msgs, which is not installed: "
-            "apt install ros-jazzy-tf2-msgs, or leave it false"
-        ) from None
-    return TFMessage

@@ -6,6 +6,7 @@ decided here; registration and covariance are one call of the estimator.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +29,8 @@ from cello3d_ros.ros.pairing import Frame, Link, Map, makes_keyframe
 METHOD_OF = {"cello3d": "model"} | {name: name for name in METHODS}
 
 _ORIGIN = np.eye(4)
+_MAX_TURN2_RAD2 = 3.0  # one radian about each axis
+_N_THREADS = min(os.cpu_count() or 1, 4)  # more than that is not worth starting
 
 
 class NotConvergedError(RegistrationError):
@@ -111,7 +114,7 @@ class Tracker:
         against it; then the chain starts again at the last of them.
         """
         rng = np.random.default_rng([self.config.seed, stamp_ns & (2**64 - 1)])
-        cloud = prepare(points, self.pipeline.cloud, rng)
+        cloud = prepare(points, self.pipeline.cloud, rng, _N_THREADS)
         frame = Frame(stamp_ns, cloud, place, place.T_odom_sensor)
         if self._latest is not None:
             frame = self._in_chain(frame, self._latest.frame)
@@ -179,6 +182,7 @@ class Tracker:
             method=METHOD_OF[self.config.covariance_mode],
             settings=self._settings(),
             registration=registered_elsewhere(T_init) if guess == EXTERNAL else None,
+            n_threads=_N_THREADS,
         )
         if not found.registration.converged:
             raise NotConvergedError(
@@ -299,8 +303,14 @@ def _broken(before: Place, now: Place) -> str:
 
 
 def _extended(T: Array, Y: Array, T_step: Array, Y_step: Array) -> tuple[Array, Array]:
-    """Return the chain one step longer: 4th order, 2nd where the 4th is not positive definite."""
-    longer = compound_right(T, Y, T_step, Y_step, order=4)
-    if not is_positive_definite(longer.Y):
-        longer = compound_right(T, Y, T_step, Y_step, order=2)
+    """Return the chain one step longer: 4th order, 2nd where the 4th means nothing.
+
+    That is where its result is not positive definite, or rotations are hardly known: the terms of
+    4th order multiply variances, and would from a radian on make a chain grow without bound.
+    """
+    if max(np.trace(Y[3:, 3:]), np.trace(Y_step[3:, 3:])) <= _MAX_TURN2_RAD2:
+        longer = compound_right(T, Y, T_step, Y_step, order=4)
+        if is_positive_definite(longer.Y):
+            return longer.T, longer.Y
+    longer = compound_right(T, Y, T_step, Y_step, order=2)
     return longer.T, longer.Y

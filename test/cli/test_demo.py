@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from consumer_rules import of_pose, of_twist
 
 from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.geometry.se3 import exp, inverse, transform
@@ -91,11 +92,15 @@ def test_the_nodes_messages_are_in_a_bag_that_others_can_read(tmp_path, bag, mod
         counts = {c.topic: c.msgcount for c in reader.connections}
         assert counts["/covariance_node/relative_pose"] == 5
         assert counts["/covariance_node/pose"] == 5
+        assert counts["/covariance_node/odometry"] == 5
+        assert counts["/covariance_node/markers"] > 0
         assert counts["/diagnostics"] >= 6
         for connection, _, raw in reader.messages():
             message = reader.deserialize(raw, connection.msgtype)
-            if connection.topic.endswith("pose"):
-                assert np.isfinite(message.pose.covariance).all()
+            if connection.topic.endswith(("pose", "odometry")):
+                assert not of_pose(message)
+            if connection.topic.endswith("odometry"):
+                assert not of_twist(message)
 
 
 def test_a_node_that_dies_is_one_sentence_and_a_summary(tmp_path, bag) -> None:

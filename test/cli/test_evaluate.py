@@ -11,6 +11,7 @@ import pytest
 from cello3d_ros.cli.main import main
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import SamplingConfig
+from cello3d_ros.covariance.features import FEATURES
 from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.geometry.se3 import Array, exp, inverse, transform
 from cello3d_ros.learning.dataset import PairRecord, open_dataset
@@ -45,6 +46,7 @@ def record(name: str, i: int, offset_m: float = 0.0, n_features: int = 704) -> P
         kept=np.ones(60, np.bool_),
         covariance=Y,
         descriptors=rng.random((1, n_features), dtype=np.float32),
+        features=rng.normal(size=len(FEATURES)),
         rotations_rad=np.zeros(1),
         shapes={"sandwich": Y / 4.0, "hessian": Y * 100.0},
     )
@@ -57,7 +59,11 @@ def folder(tmp_path: Path) -> Path:
     for name in ("hall_s0", "hall_s1", "hall_s2", "walk"):
         for i in range(2):
             dataset.write(record(name, i, 0.2 if (name, i) == ("hall_s2", 1) else 0.0))
-    provenance = {"recordings": {"hall_s0": 2}, "validation_recordings": {"hall_s1": 2}}
+    provenance = {
+        "recordings": {"hall_s0": 2},
+        "validation_recordings": {"hall_s1": 2},
+        "mean_covariance": np.diag([1e-3] * 6).tolist(),
+    }
     model = constant_model(
         4.0 * np.eye(6), 704, shape="sandwich", sampling=SAMPLING, provenance=provenance
     )
@@ -189,13 +195,18 @@ def test_some_pairs_are_enough_for_methods_on_clouds(folder: Path, walk: Path) -
     assert report["trajectories"] == {}
 
 
-def test_the_baseline_may_lie_elsewhere(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_baseline_may_be_the_mean_of_other_datasets(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     other = open_dataset(folder / "other", sampling=SAMPLING, create=True)
-    other.write(record("street", 0))
-    words = [str(folder / "other"), "--model", str(folder / "model.npz")]
-    assert main(["evaluate", *words]) == 1
-    assert "'hall_s0' that the model was trained on; name one by --baseline" in complaint(capsys)
-    assert main(["evaluate", *words, "--baseline", str(folder / "set")]) == 0
+    for i in range(2):
+        other.write(record("street", i))
+    words = [str(folder / "other"), "--model", str(folder / "model.npz"), "--json"]
+    assert main(["evaluate", *words, str(folder / "a.json")]) == 0
+    assert main(["evaluate", *words, str(folder / "b.json"), "--baseline", words[0]]) == 0
+    a, b = (json.loads((folder / name).read_text())["methods"] for name in ("a.json", "b.json"))
+    assert b["mean_covariance"]["kl_mean"] < 1.0 < a["mean_covariance"]["kl_mean"]
+    assert a["model"]["kl_mean"] == b["model"]["kl_mean"]
 
 
 @pytest.mark.parametrize(
@@ -235,4 +246,4 @@ def test_descriptors_of_another_length_are_said(
     other.write(record("street", 0, n_features=22))
     words = [str(folder / "short"), "--baseline", str(folder / "set")]
     assert main(["evaluate", *words, "--model", str(folder / "model.npz")]) == 1
-    assert "descriptor has shape (22,)" in complaint(capsys)
+    assert "descriptor input has shape (22,)" in complaint(capsys)

@@ -5,19 +5,25 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cello3d_ros.cli import train as verb
+from cello3d_ros.cli.main import main
 from cello3d_ros.config import Pipeline, SamplingConfig
+from cello3d_ros.covariance.archive import write_arrays
+from cello3d_ros.covariance.features import FEATURES
 from cello3d_ros.covariance.model import load_model
 from cello3d_ros.errors import Cello3dError, DatasetError
+from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import PairRecord, open_dataset
 from cello3d_ros.learning.examples import load_examples
 
@@ -42,6 +48,7 @@ def fill(path: Path, names: list[str], seed: int = 0, **settings: object) -> Pat
                     kept=np.ones(40, np.bool_),
                     covariance=xi.T @ xi / 39,
                     descriptors=rng.random((2, 22), dtype=np.float32),
+                    features=rng.normal(size=len(FEATURES)),
                     rotations_rad=np.array([0.0, np.pi / 2]),
                     shapes={"sandwich": np.eye(6) * 1e-4, "hessian": np.eye(6) * 1e-6},
                 )
@@ -66,7 +73,9 @@ def test_a_model_with_its_provenance_and_a_table_come_out(
     out = tmp_path / "model.npz"
     cello3d_train(folder, "--out", out, "--validation", "*_s3")
     model = load_model(out)
-    assert model.n_examples == 3 * 5 * 2
+    assert model.n_examples == 3 * 5  # global features: without turned copies
+    assert (model.features, model.n_features) == ("global", len(FEATURES))
+    assert len(model.rho_quantiles) == 101
     assert model.shape == "sandwich"
     assert model.provenance["recordings"] == {"hall_s0": 5, "hall_s1": 5, "wood_s0": 5}
     assert model.provenance["validation_recordings"] == {"hall_s3": 5, "wood_s3": 5}
@@ -76,7 +85,7 @@ def test_a_model_with_its_provenance_and_a_table_come_out(
     printed = capsys.readouterr().out
     assert "15 pairs of 3 recordings" in printed
     assert "validation (10 pairs)" in printed
-    for row in ("model", "mean covariance", "constant relative"):
+    for row in ("model", "mean covariance", "constant"):
         assert f"\n  {row} " in printed
     figures = model.provenance["figures"]["validation"]["model"]
     assert f"{figures['kl_mean']:.4g}" in printed
@@ -87,7 +96,7 @@ def test_validation_and_excluded_recordings_never_enter_training(
 ) -> None:
     outs = [tmp_path / "one.npz", tmp_path / "two.npz"]
     words = ("--validation", "hall_s3", "--exclude", "wood_*", "--config", tmp_path / "c.yaml")
-    (tmp_path / "c.yaml").write_text("training: {max_iterations: 3}")
+    (tmp_path / "c.yaml").write_text("training: {max_iterations: 3, features: descriptor}")
     cello3d_train(folder, "--out", outs[0], *words)
     model = load_model(outs[0])
     dataset = open_dataset(folder)
@@ -175,6 +184,44 @@ def test_the_papers_descent_is_a_flag(folder: Path, tmp_path: Path) -> None:
     cello3d_train(folder, "--out", tmp_path / "model.npz", "--optimizer", "sgd")
     training = load_model(tmp_path / "model.npz").provenance["training"]
     assert (training["optimizer"], training["learning_rate"]) == ("sgd", 1e-5)
+
+
+def spoiled(item: str, value: float) -> Callable[[dict[str, Array]], None]:
+    def spoil(arrays: dict[str, Array]) -> None:
+        arrays[item] = arrays[item].copy()
+        arrays[item][0] = value
+
+    return spoil
+
+
+def test_what_cannot_be_trained_on_is_one_sentence_and_leaves_nothing(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = folder / "pairs" / "hall_s1_2_3.npz"
+    with np.load(file) as archive:
+        good = dict(archive)
+    lone = ["--exclude", "hall_*", "wood_s3"]
+    cases: list[tuple[Callable[[dict[str, Array]], None], list[str], str]] = [
+        (
+            spoiled("descriptors", np.nan),
+            [],
+            "hall_s1_2_3.npz is damaged.* descriptors is not fin",
+        ),
+        (spoiled("covariance", np.nan), [], "hall_s1_2_3.npz is damaged.* covariance is not fin"),
+        (spoiled("covariance", 0.0), [], "hall_s1_2_3.npz is damaged.* not a positive definite"),
+        (spoiled("shapes", np.inf), [], "hall_s1_2_3.npz is damaged.* is not finite"),
+        (lambda arrays: None, lone, "at least two recordings.* found only wood_s0"),
+        (lambda arrays: None, ["--config", str(tmp_path / "none.yaml")], "none.yaml"),
+    ]
+    for spoil, flags, sentence in cases:
+        arrays = dict(good)
+        spoil(arrays)
+        write_arrays(file, arrays)
+        assert main(["train", str(folder), "--out", str(tmp_path / "model.npz"), *flags]) == 1
+        captured = capsys.readouterr()
+        assert re.fullmatch(f"cello3d: .*{sentence}.*\n", captured.err), captured.err
+        assert captured.out == ""
+        assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 
 def test_ctrl_c_in_training_writes_the_best_so_far(tmp_path: Path) -> None:

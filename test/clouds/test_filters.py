@@ -51,3 +51,14 @@ def test_a_subsample_has_no_repetition_and_follows_its_seed():
     np.testing.assert_array_equal(first, subsample(1000, 100, np.random.default_rng(4)))
     assert not np.array_equal(first, subsample(1000, 100, np.random.default_rng(5)))
     np.testing.assert_array_equal(subsample(7, 100, np.random.default_rng(0)), np.arange(7))
+
+
+def test_the_draw_is_the_first_of_a_permutation_in_each_cube():
+    points = np.random.default_rng(5).normal(size=(5000, 3)) * [1, 1, 0.01] - 1e3
+    kept = limit_density(points, 0.1, 2, np.random.default_rng(6))
+    cells = np.floor((points - points.min(axis=0)) / 0.1).astype(int)
+    counts, expected = {}, np.zeros(5000, bool)
+    for i in np.random.default_rng(6).permutation(5000):
+        counts[cell] = counts.get(cell := tuple(cells[i]), 0) + 1
+        expected[i] = counts[cell] <= 2
+    np.testing.assert_array_equal(kept, points[expected])

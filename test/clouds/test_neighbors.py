@@ -11,6 +11,18 @@ CASES = {
     "lattice full of ties": lambda rng: rng.integers(0, 6, (3000, 3)).astype(float),
     "all the same": lambda rng: np.ones((100, 3)),
     "fewer than a leaf": lambda rng: rng.normal(size=(5, 3)),
+    "duplicates": lambda rng: np.repeat(rng.normal(size=(200, 3)), 30, axis=0),
+    "clusters far apart": lambda rng: (
+        np.repeat(1e5 * rng.normal(size=(20, 3)), 7, axis=0) + rng.normal(size=(140, 3))
+    ),
+    "rings of a lidar": lambda rng: np.stack(
+        [
+            (r := 3.0 * (1 + np.arange(3000) // 300)) * np.cos(a := 0.0209 * np.arange(3000)),
+            r * np.sin(a),
+            0 * a,
+        ],
+        axis=1,
+    ),
     "one": lambda rng: rng.normal(size=(1, 3)),
     "far from the origin": lambda rng: rng.normal(size=(1000, 3)) + 1e6,
 }
@@ -35,11 +47,48 @@ def test_neighbors_are_those_of_an_independent_tree(case, k):
     assert all(len(set(row[row >= 0])) == (row >= 0).sum() for row in indices)
 
 
+@pytest.mark.parametrize("case", CASES)
+def test_of_equally_far_points_the_first_in_order_wins(case):
+    rng = np.random.default_rng(9)
+    tree = build_tree(CASES[case](rng)[:1000])
+    queries = tree.points[:: max(1, len(tree.points) // 100)]
+    difference = tree.points - queries[:, None]
+    squares = difference[..., 0] ** 2 + difference[..., 1] ** 2 + difference[..., 2] ** 2
+    expected = np.argsort(squares, axis=1, kind="stable")[:, :7]
+    _, indices = nearest(tree, queries, 7)
+    np.testing.assert_array_equal(indices[:, : expected.shape[1]], expected)
+    np.testing.assert_array_equal(indices[:, expected.shape[1] :], -1)
+
+
+def test_neighbors_beyond_the_largest_distance_are_left_out():
+    rng = np.random.default_rng(10)
+    tree = build_tree(rng.normal(size=(2000, 3)))
+    queries = 2 * rng.normal(size=(500, 3))
+    every2, indices = nearest(tree, queries, 4)
+    near2, near = nearest(tree, queries, 4, max_distance2=0.09)
+    np.testing.assert_array_equal(near2, np.where(every2 <= 0.09, every2, np.inf))
+    np.testing.assert_array_equal(near, np.where(every2 <= 0.09, indices, -1))
+
+
+def test_a_tree_has_the_same_order_whatever_the_number_of_threads():
+    points = np.random.default_rng(11).normal(size=(20000, 3)) * [5, 3, 0.1]
+    one, four = build_tree(points), build_tree(points, n_threads=4)
+    for a, b in zip(one, four):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_points_too_far_apart_for_a_squared_distance_are_no_neighbors():
+    tree = build_tree(np.array([[0.0, 0.0, 0.0], [1e200, 0.0, 0.0], [3.0, 0.0, 0.0]]))
+    distances2, indices = nearest(tree, np.array([[1.0, 0.0, 0.0]]), 3)
+    np.testing.assert_array_equal(distances2[0, :2], [1.0, 4.0])
+    assert indices[0, 2] == -1
+
+
 def test_many_queries_in_threads_are_answered_as_one_by_one():
     rng = np.random.default_rng(8)
     tree = build_tree(rng.normal(size=(3000, 3)))
     queries = rng.normal(size=(10000, 3))
-    together = nearest(tree, queries, 3)
+    together = nearest(tree, queries, 3, n_threads=3)
     apart = [nearest(tree, queries[part], 3) for part in (slice(0, 17), slice(17, None))]
     np.testing.assert_array_equal(together[0], np.vstack([a[0] for a in apart]))
     np.testing.assert_array_equal(together[1], np.vstack([a[1] for a in apart]))

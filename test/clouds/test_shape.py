@@ -3,8 +3,9 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from cello3d_ros.clouds.covariances import covariances
 from cello3d_ros.clouds.neighbors import build_tree
-from cello3d_ros.clouds.shape import local_shape, prepare
+from cello3d_ros.clouds.shape import _shape, local_shape, prepare
 from cello3d_ros.config import CloudConfig
 from cello3d_ros.errors import CloudError
 
@@ -27,6 +28,74 @@ def test_local_shape_is_that_of_an_independent_computation(room):
     agreement = np.abs(np.einsum("ij,ij->i", normals, expected_normals))
     assert (agreement > 1 - 1e-9).mean() > 0.999  # corners may have no single normal
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
+
+
+CASES = {
+    "normal": lambda rng: rng.normal(size=(1500, 3)),
+    "plane": lambda rng: rng.uniform(-5, 5, (1500, 3)) * [1, 1, 0],
+    "line": lambda rng: rng.uniform(-5, 5, (500, 1)) * [1.0, 2.0, 3.0],
+    "lattice full of ties": lambda rng: rng.integers(0, 9, (3000, 3)).astype(float),
+    "plane lattice": lambda rng: np.stack(
+        np.meshgrid(np.arange(40.0), np.arange(40.0), [0.0]), axis=-1
+    ).reshape(-1, 3),
+    "duplicates": lambda rng: np.repeat(rng.normal(size=(200, 3)), 7, axis=0),
+    "far from the origin": lambda rng: rng.normal(size=(1000, 3)) + 1e6,
+    "fewer than the neighbors": lambda rng: rng.normal(size=(11, 3)),
+    "two scales": lambda rng: np.vstack(
+        [1e-4 * rng.normal(size=(500, 3)), 1e4 * rng.normal(size=(500, 3))]
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("k", [1, 6, 20])
+def test_covariances_are_of_the_nearest_and_of_equally_far_ones_of_the_first(case, k):
+    tree = build_tree(CASES[case](np.random.default_rng(12)))
+    points = tree.points
+    n, n_leaves = len(points), len(tree.lanes)
+    found = np.empty((n_leaves, 6, 16))
+    covariances(tree.leaves, n, k, 0, n_leaves, found)
+    difference = points - points[:, None]
+    squares = difference[..., 0] ** 2 + difference[..., 1] ** 2 + difference[..., 2] ** 2
+    first = np.argsort(squares, axis=1, kind="stable")[:, :k]
+    near = np.take_along_axis(difference, first[..., None], axis=1)
+    near = near - near.mean(axis=1, keepdims=True)
+    expected = np.einsum("nki,nkj->nij", near, near) / min(k, n)
+    upper = expected[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    scale = np.take_along_axis(squares, first[:, -1:], axis=1) + 1e-300
+    ours = found.transpose(0, 2, 1).reshape(-1, 6)
+    np.testing.assert_allclose(ours[:n] / scale, upper / scale, atol=1e-13)
+    np.testing.assert_array_equal(ours[n:], 0.0)
+
+
+def test_local_shape_does_not_depend_on_the_number_of_threads():
+    tree = build_tree(np.random.default_rng(13).normal(size=(9000, 3)) * [9, 9, 0.1])
+    for a, b in zip(local_shape(tree, 20), local_shape(tree, 20, n_threads=3)):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
+@pytest.mark.parametrize("ratios", [(0, 0, 0), (1, 0, 0), (1, 1, 0), (1, 1, 1), (3, 2, 1)])
+@pytest.mark.parametrize("noise", [0.0, 1e-9, 1e-3])
+def test_shapes_are_those_of_the_eigenvalues(scale, ratios, noise):
+    rng = np.random.default_rng(14)
+    A = rng.normal(size=(48, 3, 3))
+    turns = np.linalg.qr(A)[0]
+    turns[:6] = np.eye(3)[[[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [2, 1, 0], [1, 0, 2]]]
+    squares = scale * (np.square(ratios) + noise * rng.uniform(size=(48, 3)))
+    C = np.einsum("nij,nj,nkj->nik", turns, squares, turns)
+    rows = C[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].reshape(3, 16, 6).transpose(0, 2, 1)
+    normals, planarity, cylindricality = np.empty((45, 3)), np.empty(45), np.empty(45)
+    _shape(np.ascontiguousarray(rows), normals, planarity, cylindricality)
+    values = np.linalg.eigvalsh(C)[:45]
+    s3, s2, s1 = np.sqrt(np.maximum(values, 0.0)).T
+    # s3 of a flat one is the square root of what rounding left
+    s1 = np.where(s1 > 0.0, s1, 1.0)
+    np.testing.assert_allclose(planarity, (s2 - s3) / s1, atol=1e-7)
+    np.testing.assert_allclose(cylindricality, (s1 - s2) / s1 * (values[:, 2] > 0), atol=1e-7)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
+    along = np.einsum("ni,nij,nj->n", normals, C[:45], normals)
+    np.testing.assert_allclose(along, values[:, 0], atol=1e-14 * scale)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +135,7 @@ def test_prepare_filters_and_follows_its_seed(room):
     distances = np.linalg.norm(cloud.points, axis=1)
     assert distances.min() >= 1.0
     assert distances.max() <= 4.0
-    again = prepare(room[0], config, np.random.default_rng(5))
+    again = prepare(room[0], config, np.random.default_rng(5), n_threads=2)
     for a, b in zip(cloud[:4], again[:4]):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(cloud.tree.points, cloud.points)

@@ -1,8 +1,17 @@
 import numpy as np
 import pytest
 
+from cello3d_ros.clouds.neighbors import build_tree
+from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import GridConfig
-from cello3d_ros.covariance.descriptor import BINS, N_CELL, describe_overlap, n_features
+from cello3d_ros.covariance.descriptor import (
+    BINS,
+    N_CELL,
+    describe_clouds,
+    describe_overlap,
+    n_features,
+)
+from cello3d_ros.geometry.se3 import exp, inverse, transform
 
 GRID = GridConfig()
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -85,3 +94,23 @@ def test_no_points_give_zeros():
     np.testing.assert_array_equal(
         describe_overlap(empty, empty, np.empty(0), np.empty(0), GRID), np.zeros(704)
     )
+
+
+def test_clouds_are_described_by_their_overlapping_points_in_one_frame(overlap):
+    points, normals, planarity, cylindricality = overlap
+    rng = np.random.default_rng(22)
+    first, seen = rng.uniform(size=len(points)) < 0.4, rng.uniform(size=len(points)) < 0.7
+    T = exp([3.0, -1.0, 0.5, 0.2, -0.1, 2.0])
+    back = inverse(T)
+    tree = build_tree(points)  # not looked at
+    one = Cloud(points[first], normals[first], planarity[first], cylindricality[first], tree)
+    other = Cloud(
+        transform(back, points[~first]),
+        normals[~first] @ back[:3, :3].T,
+        planarity[~first],
+        cylindricality[~first],
+        tree,
+    )
+    d = describe_clouds((one, other), (seen[first], seen[~first]), (np.eye(4), T), GRID)
+    expected = describe_overlap(*(values[seen] for values in overlap), GRID)
+    np.testing.assert_allclose(d, expected, atol=1e-12)

@@ -55,6 +55,15 @@ def test_the_description_does_not_depend_on_the_frame_of_the_reference(pair):
         )
 
 
+def test_the_description_does_not_depend_on_the_number_of_threads(pair):
+    one = describe(*pair, T_TRUE, PIPELINE)
+    four = describe(*pair, T_TRUE, PIPELINE, n_threads=4)
+    for a, b in zip(
+        [*one.descriptors, *one.shapes.values()], [*four.descriptors, *four.shapes.values()]
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_a_turned_description_is_that_of_turned_clouds(pair):
     """P -> RP, Q -> RQ, T -> R T R^-1; the paper's augmentation."""
     reading, reference = pair

@@ -56,7 +56,7 @@ def test_fusion_improves_a_wrong_prior():
     rng = np.random.default_rng(2)
     Y = np.diag([1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6])
     F = 25.0 * Y
-    xi = rng.multivariate_normal(np.full(6, 0.01), Y, size=40)
+    xi = rng.multivariate_normal(np.full(6, 0.01), Y, size=80)
     assert kl(Y, fused(F, xi)) < 0.6 * kl(Y, F)
 
 

@@ -83,7 +83,7 @@ def test_prediction_is_the_printed_weighted_mean() -> None:
 
 def test_zero_theta_predicts_the_training_mean() -> None:
     model = a_model(0.0)
-    F, nearest, neighbors = predict(model, descriptors(1, seed=5)[0])
+    F, nearest, neighbors, _ = predict(model, descriptors(1, seed=5)[0])
     np.testing.assert_allclose(F, model.covariances.mean(axis=0), rtol=1e-13)
     assert nearest == 0.0
     assert neighbors == pytest.approx(N)
@@ -95,14 +95,14 @@ def test_very_large_theta_predicts_the_nearest_example(factor: float) -> None:
     for d in descriptors(20, seed=6):
         q = project(d, model.theta, model.mean, model.scale)
         k = np.argmin(np.linalg.norm((model.projections - q) / factor, axis=1))
-        F, nearest, neighbors = predict(model, d)
+        F, nearest, neighbors, _ = predict(model, d)
         np.testing.assert_allclose(F, model.covariances[k], rtol=1e-12)
         assert np.isfinite(nearest)
         assert neighbors == pytest.approx(1.0)
 
 
 def test_far_from_every_example_the_weights_are_never_zero_by_zero() -> None:
-    F, nearest, neighbors = predict(a_model(), np.full(D, 1e6))
+    F, nearest, neighbors, _ = predict(a_model(), np.full(D, 1e6))
     assert gaussian.is_positive_definite(F)
     assert nearest > 1e6
     assert 1 <= neighbors <= N
@@ -166,7 +166,7 @@ def test_one_example_is_predicted_everywhere() -> None:
     Y = covariances(1)[0]
     model = constant_model(Y, D, mean_weight=0.3, provenance={"why": "baseline"})
     for d in (np.zeros(D), np.full(D, 1e9)):
-        F, nearest, neighbors = predict(model, d)
+        F, nearest, neighbors, _ = predict(model, d)
         np.testing.assert_allclose(F, Y, rtol=1e-13)
         assert (nearest, neighbors) == (0.0, 1.0)
 
@@ -380,7 +380,7 @@ def test_the_same_model_makes_the_same_bytes_without_pickle(saved: Path, tmp_pat
     with np.load(saved, allow_pickle=False) as archive:
         assert {archive[name].dtype.kind for name in archive.files} == {"f", "u"}
         header = json.loads(archive["header"].tobytes())
-    assert header["format_version"] == 1
+    assert header["format_version"] == 2
     assert header["conventions"]["order"] == "u omega"
     assert header["config"]["sampling"]["variance"] == SamplingConfig().variance
 
@@ -494,7 +494,7 @@ def test_a_covariance_that_is_not_positive_definite_is_named(saved: Path) -> Non
 
 HEADERS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "format": (lambda h: h.update(format="other"), "not that of a cello3d-model file"),
-    "version": (lambda h: h.update(format_version=2), "format version 2, this package reads 1"),
+    "version": (lambda h: h.update(format_version=3), "format version 3, this package reads 2"),
     "no version": (lambda h: h.pop("format_version"), "format version None"),
     "order": (lambda h: h["conventions"].update(order="omega u"), "conventions are"),
     "side": (lambda h: h["conventions"].pop("side"), "conventions are"),
@@ -610,3 +610,32 @@ def test_the_shipped_model_has_its_place_in_the_package() -> None:
     path = shipped_model_path()
     assert path.parts[-3:] == ("cello3d_ros", "models", "general.npz")
     assert path.is_absolute()
+
+
+def test_novelty_is_the_share_of_training_pairs_that_were_nearer() -> None:
+    d = descriptors()[0]
+    model = a_model(rho_quantiles=np.array([0.0, 1.0, 2.0, 3.0, 4.0]))
+    assert predict(model, d).novelty < 1e-20  # the example itself
+    theta = np.zeros((R, D))
+    theta[0, 0] = 1.0
+    one = Model(
+        theta=theta,
+        mean=np.zeros(D),
+        scale=np.ones(D),
+        projections=np.zeros((1, R)),
+        covariances=covariances(1),
+        rho_quantiles=np.array([0.0, 1.0, 2.0, 3.0, 4.0]),
+    )
+    for rho, novelty in ((1.0, 0.25), (2.5, 0.625), (4.0, 1.0), (100.0, 1.0)):
+        away = np.sqrt(rho) * np.eye(D)[0]
+        assert predict(one, away).novelty == pytest.approx(novelty)
+    assert predict(dataclasses.replace(one, rho_quantiles=np.zeros(0)), d).novelty == 0.0
+
+
+@pytest.mark.parametrize("name", ["rho_quantiles", "neighbors_quantiles"])
+def test_quantiles_that_are_none_are_refused(name: str) -> None:
+    for values in (np.array([0.0, 2.0, 1.0]), np.zeros((2, 2))):
+        with pytest.raises(ModelError, match=f"{name} are not ascending"):
+            a_model(**{name: values})
+    with pytest.raises(ModelError, match="features must be one of"):
+        a_model(features="all")

@@ -24,6 +24,7 @@ from cello3d_ros.learning.cluster import (
     sample_recording_on,
 )
 from cello3d_ros.learning.cluster_tasks import _Reader
+from cello3d_ros.learning.dataset import open_dataset
 from cello3d_ros.learning.pairs import pairs
 from cello3d_ros.learning.sampling import sample_recording
 from cello3d_ros.recordings import open_recording
@@ -164,6 +165,28 @@ def test_workers_keep_blas_to_one_thread(recording, cluster):
     assert len(used) == 2
     assert {1} in used
     assert all(found in ({1}, {os.cpu_count()}) for found in used)  # or was given no task
+
+
+@pytest.mark.parametrize("ship", [False, True])
+def test_simulated_worlds_are_scanned_anew_as_on_one_machine(tmp_path, cluster, ship):
+    pytest.importorskip("open3d")
+    folder, config = tmp_path / "bag", tmp_path / "config.yaml"
+    config.write_text(CONFIG)
+    flags = ["--seed", "2", "--scans", "2", "--scanner", "spinning16"]
+    assert main(["simulate", "rooms", *flags, "--out", str(folder)]) == 0
+    sets = [tmp_path / "here", tmp_path / "there", tmp_path / "plain"]
+    there = ["--scheduler", cluster, "--block", "25", *(["--ship-clouds"] if ship else [])]
+    for out, more in zip(sets, (["--noise", "0.02"], ["--noise", "0.02", *there], [])):
+        command = ["sample", str(folder), "--config", str(config), "--samples", "60"]
+        assert main([*command, "--out", str(out), *more]) == 0
+    one, two, plain = ({p.name: p.read_bytes() for p in s.rglob("pairs/*")} for s in sets)
+    assert one == two
+    assert len(one) == 1
+    assert one != plain
+    facts = [open_dataset(path).recordings["bag"] for path in sets]
+    assert facts[0]["noise"] == "rescans"
+    assert "noise" not in facts[2]
+    assert facts[0]["fingerprint"] == facts[1]["fingerprint"]
 
 
 def test_only_what_is_asked_for_is_sampled(recording, cluster, local):

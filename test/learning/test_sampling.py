@@ -21,6 +21,7 @@ from cello3d_ros.learning.sampling import (
     stops,
 )
 from cello3d_ros.recordings.recording import Scan
+from cello3d_ros.recordings.scanner import SCANNERS, Echoes, measure
 
 PIPELINE = Pipeline(
     cloud=CloudConfig(voxel_m=0.1),
@@ -288,6 +289,67 @@ def test_noise_widens_the_covariance_and_none_changes_nothing(room):
         traces.append(np.trace(one.covariance))
     assert traces[1] == pytest.approx(traces[0], rel=1e-3)
     assert traces[2] > 1.5 * traces[0]
+
+
+class Walls:
+    """A recording of a closed room, with or without what its beams met."""
+
+    name = "walls"
+
+    def __init__(self, rescannable):
+        self.rescannable = rescannable
+
+    def __len__(self):
+        return 2
+
+    def __iter__(self):
+        scanner = SCANNERS["spinning32"]
+        beams = scanner.directions()
+        for k, at in enumerate(([0.0, 0, 0], [0.2, 0.1, 0])):
+            sides = np.array([4.0, 3, 1.5]) - np.sign(beams) * at
+            distances = (sides / np.maximum(np.abs(beams), 1e-9)).min(axis=1)
+            echoes = Echoes(scanner, distances, np.ones(len(beams)))
+            points = measure(echoes, np.random.default_rng([9, k]))
+            yield Scan(
+                stamp_ns=k,
+                points=points,
+                T_world_sensor=exp([*at, 0, 0, 0]),
+                echoes=echoes if self.rescannable else None,
+            )
+
+
+def test_new_scans_widen_the_covariance_with_their_noise_and_none_changes_nothing():
+    def record(sigma, rescannable=True, n_threads=1, n=60):
+        walls, sampling = Walls(rescannable), with_samples(n, noise_m=sigma)
+        return next(sample_recording(walls, [(0, 1)], PIPELINE, sampling, n_threads))
+
+    assert_same(record(0.0), record(0.0, False))
+    found = [record(sigma) for sigma in (0.01, 0.03, 0.09)]
+    assert all(one.accepted for one in found)
+    assert_same(found[1], record(0.03, n_threads=2))
+    traces = [np.trace(one.covariance) for one in found]
+    assert 1.5 * traces[0] < traces[1] < traces[2] / 1.5
+    added = record(0.03, rescannable=False)
+    assert added.accepted
+    assert not np.array_equal(added.xi, found[1].xi)
+    for name, shape in added.shapes.items():  # what describes the pair is the recorded scan
+        np.testing.assert_array_equal(shape, found[1].shapes[name])
+
+
+def test_a_new_scan_that_leaves_no_cloud_is_counted(monkeypatch):
+    from cello3d_ros.learning import noise
+
+    clouds = iter(range(1000))
+
+    def one_in_four(points, config, rng):
+        if next(clouds) % 4 == 3:
+            raise CloudError("nothing left")
+        return prepare(points, config, rng)
+
+    monkeypatch.setattr(noise, "prepare", one_in_four)
+    sampling = with_samples(40, noise_m=0.01)
+    record = next(sample_recording(Walls(True), [(0, 1)], PIPELINE, sampling))
+    assert (record.n_failed, len(record.xi)) == (20, 20)
 
 
 def test_a_recording_that_ends_early_says_so_after_the_pairs_that_it_has():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cello3d_ros.config import CloudConfig, Pipeline, SamplingConfig, TrainingConfig
+from cello3d_ros.covariance.features import FEATURES
 from cello3d_ros.covariance.model import predict
 from cello3d_ros.errors import ConfigError, DatasetError
 from cello3d_ros.geometry.gaussian import is_positive_definite, kl, matrix_sqrt
@@ -24,7 +25,9 @@ from cello3d_ros.learning.loss import (
 )
 from cello3d_ros.learning.training import train
 
-PAPER = TrainingConfig(shape="none", theta="diagonal", mean_weight=0.0, regularization=1e-3)
+PAPER = TrainingConfig(
+    features="descriptor", shape="none", theta="diagonal", mean_weight=0.0, regularization=1e-3
+)
 SIZE = np.diag([1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2])  # det of SIZE SIZE^T is 1e-24
 
 
@@ -70,7 +73,7 @@ def noise(n: int, seed: int) -> Examples:
 
 
 def a_problem(mean_weight: float = 0.05, rotations: tuple[float, ...] = (0.0, 1.0)) -> Problem:
-    config = TrainingConfig(shape="none", mean_weight=mean_weight)
+    config = TrainingConfig(features="descriptor", shape="none", mean_weight=mean_weight)
     examples = some(rotations=rotations)
     return leave_out_problem(examples, config, np.zeros(5), np.ones(5))
 
@@ -156,7 +159,7 @@ def test_zero_theta_predicts_the_mean_of_the_other_recordings() -> None:
 @pytest.mark.parametrize("mean_weight", [0.0, 0.5])
 def test_an_example_never_sees_its_own_recording(mean_weight: float) -> None:
     examples = some(rotations=(0.0, np.pi / 2))
-    config = TrainingConfig(shape="none", mean_weight=mean_weight)
+    config = TrainingConfig(features="descriptor", shape="none", mean_weight=mean_weight)
     own = examples.groups == "world_s1"
     changed = dataclasses.replace(
         examples, covariances=np.where(own[:, None, None], 1e6 * np.eye(6), examples.covariances)
@@ -182,7 +185,7 @@ def test_planted_feature_is_found_and_beats_the_mean() -> None:
 
 def test_targets_are_the_pairs_as_they_were_recorded() -> None:
     examples = some(rotations=(0.5, 0.0, 1.0))
-    config = TrainingConfig(shape="none")
+    config = TrainingConfig(features="descriptor", shape="none")
     problem = leave_out_problem(examples, config, np.zeros(5), np.ones(5))
     np.testing.assert_array_equal(problem.X, examples.features[:, 1])
     np.testing.assert_array_equal(problem.Y, examples.covariances)
@@ -241,7 +244,9 @@ def test_pure_noise_is_within_two_percent_of_the_mean(form: str) -> None:
 def test_the_model_predicts_as_training_judged_it(form: str, shape: str) -> None:
     examples, validation = some(seed=0, rotations=(0.0, 0.5)), some(9, seed=1)
     validation = dataclasses.replace(validation, groups=np.array(["v"] * 9))
-    config = TrainingConfig(shape=shape, theta=form, rank=2, max_iterations=5, mean_weight=0.1)
+    config = TrainingConfig(
+        features="descriptor", shape=shape, theta=form, rank=2, max_iterations=5, mean_weight=0.1
+    )
     training = train(examples, config, validation)
     F = np.array(
         [
@@ -260,7 +265,13 @@ def test_the_model_predicts_as_training_judged_it(form: str, shape: str) -> None
 
 def test_a_turned_copy_predicts_the_turned_covariance() -> None:
     examples = some(6, rotations=(0.0, 0.7))
-    config = TrainingConfig(shape="sandwich", theta="diagonal", mean_weight=0.0, max_iterations=1)
+    config = TrainingConfig(
+        features="descriptor",
+        shape="sandwich",
+        theta="diagonal",
+        mean_weight=0.0,
+        max_iterations=1,
+    )
     model = train(examples, config).model
     Ad = adjoint(exp([0, 0, 0, 0, 0, 0.7]))
     for k in range(6):
@@ -278,14 +289,18 @@ def test_constant_features_weigh_nothing() -> None:
     examples = some(n_features=6)
     features = examples.features.copy()
     features[:, :, 2] = 0.1
-    config = TrainingConfig(shape="none", theta="low_rank", rank=3, max_iterations=3)
+    config = TrainingConfig(
+        features="descriptor", shape="none", theta="low_rank", rank=3, max_iterations=3
+    )
     model = train(dataclasses.replace(examples, features=features), config).model
     assert model.scale[2] == 1.0
     assert not model.theta[:, 2].any()
 
 
 def test_training_twice_gives_the_same_bits() -> None:
-    config = TrainingConfig(shape="none", theta="low_rank", rank=2, max_iterations=15)
+    config = TrainingConfig(
+        features="descriptor", shape="none", theta="low_rank", rank=2, max_iterations=15
+    )
     one, two = train(some(), config).model, train(some(), config).model
     for name in ("theta", "mean", "scale", "projections", "covariances"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
@@ -425,9 +440,19 @@ def test_a_recording_cannot_be_validated_on_and_trained_on() -> None:
         train(some(), PAPER, some(3))
 
 
+def test_a_singular_shape_is_one_sentence() -> None:
+    examples = some()
+    examples.shapes["sandwich"][5] = np.diag([1.0, 1, 1, 1, 1, 0])
+    with pytest.raises(DatasetError, match="the sandwich of a pair is singular to rounding"):
+        train(examples, TrainingConfig(shape="sandwich"))
+
+
 def test_a_missing_shape_is_named() -> None:
     with pytest.raises(DatasetError, match="does not hold the sandwich"):
-        train(dataclasses.replace(some(), shapes={}), TrainingConfig(shape="sandwich"))
+        train(
+            dataclasses.replace(some(), shapes={}),
+            TrainingConfig(features="descriptor", shape="sandwich"),
+        )
 
 
 def filled(path: Path, names: tuple[str, ...], **settings: object) -> Dataset:
@@ -448,6 +473,7 @@ def filled(path: Path, names: tuple[str, ...], **settings: object) -> Dataset:
                     kept=np.arange(500) < 450,
                     covariance=covariances(1, rng)[0],
                     descriptors=rng.random((2, 11), dtype=np.float32),
+                    features=rng.normal(size=len(FEATURES)),
                     rotations_rad=np.array([0.0, np.pi / 2]),
                     shapes={"sandwich": covariances(1, rng)[0]},
                 )

@@ -29,3 +29,17 @@ def test_overlap_does_not_depend_on_the_frames(room):
     there = find_overlap(cloud(transform(inverse(T), room[0][:2000])), reference, T, 0.2)
     assert abs(here.ratio - there.ratio) < 1e-3
     assert abs(int(here.reference.sum()) - int(there.reference.sum())) <= 2
+
+
+def test_overlap_is_that_of_all_distances_whatever_the_number_of_threads(room):
+    T = exp([0.3, -0.2, 0.1, 0.05, 0.0, 0.4])
+    reading, reference = cloud(room[0][:6000]), cloud(room[1][:3000])
+    found = find_overlap(reading, reference, T, 0.1, 3)
+    moved = transform(T, reading.points)
+    squares = ((moved[:, None] - reference.points) ** 2).sum(axis=2)
+    assert (found.reading == (squares.min(axis=1) <= 0.01)).all()
+    assert (found.reference == (squares.min(axis=0) <= 0.01)).all()
+    assert 0 < found.reference.sum() < len(found.reference)
+    np.testing.assert_allclose(found.distances2, np.sort(squares, axis=1)[:, :3], atol=1e-12)
+    for a, b in zip(found, find_overlap(reading, reference, T, 0.1, 3, n_threads=2)):
+        np.testing.assert_array_equal(a, b)

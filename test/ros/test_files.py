@@ -69,7 +69,10 @@ def test_launch_starts_what_is_installed_and_sets_parameters_that_are_there() ->
 def test_launch_uses_every_argument_and_no_other() -> None:
     path = LAUNCH / "cello3d.launch.py"
     used = set(re.findall(r'given\["(\w+)"\]', path.read_text())) | {"model", "covariance_mode"}
-    assert used == set(constant(path, "ARGUMENTS"))
+    remapped = constant(path, "TOPICS")
+    assert used | set(remapped) == set(constant(path, "ARGUMENTS"))
+    heard = (ROOT / "cello3d_ros" / "ros" / "inputs.py").read_text()
+    assert [name for name in remapped if f'"{name}"' not in heard] == []
 
 
 def test_the_demo_passes_on_arguments_that_are_there() -> None:
@@ -140,6 +143,14 @@ def test_robot_localization_fuses_velocities_only() -> None:
     ekf = tree["ekf_filter_node"]["ros__parameters"]
     assert ekf["odom0_config"] == [False] * 6 + [True] * 6 + [False] * 3
     assert not ekf["odom0_differential"]
+
+
+def test_remappings_of_the_examples_are_of_topics_that_the_node_hears() -> None:
+    heard = (ROOT / "cello3d_ros" / "ros" / "inputs.py").read_text()
+    for path in [*EXAMPLES, ROOT / "README.md", ROOT / "docs" / "integration.md"]:
+        names = re.findall(r"-r (\w+):=/", path.read_text())
+        assert [name for name in names if name != "__node" and f'"{name}"' not in heard] == []
+        assert names
 
 
 def test_fuse_takes_each_message_as_a_step() -> None:

@@ -193,7 +193,7 @@ def test_tf_is_published_when_asked_for_or_the_node_says_what_is_missing(
     except ImportError:
         with NodeProcess(tmp_path / "log", domain_id, {"node.publish_tf": "true"}) as process:
             assert process.wait(60.0) == 1
-            assert "node.publish_tf needs tf2_msgs" in process.output()
+            assert "node.publish_tf needs the package tf2_msgs" in process.output()
             assert "Traceback" not in process.output()
         return
     assert tf2_msgs.msg.TFMessage

@@ -1,5 +1,6 @@
 """Parameters of a running node: descriptions, ranges, live changes."""
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
@@ -53,3 +54,17 @@ def test_a_live_change_that_cannot_be_is_refused_with_a_reason(
     assert not verdict.successful
     assert reason in verdict.reason
     robot.assert_right_again()
+
+
+def test_modes_and_scale_change_from_one_cloud_to_the_next(change, robot) -> None:
+    for mode in ("hessian", "fused", "constant", "cello3d"):
+        assert change("node.covariance_mode", mode).successful
+        robot.assert_right_again()
+        assert robot.player.replay.last_status["covariance_mode"] == mode
+    plain = np.trace(robot.player.replay.relative[robot.stamp_ns].C)
+    assert change("node.scale", 4.0).successful
+    robot.assert_right_again()
+    C = robot.player.replay.relative[robot.stamp_ns].C
+    assert np.trace(C) == pytest.approx(4.0 * plain, rel=1e-6)
+    assert change("node.scale", 1.0).successful
+    assert not change("node.covariance_mode", "best").successful

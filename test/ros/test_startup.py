@@ -36,6 +36,8 @@ def last_words(log: Path, domain_id: int, parameters, ros_arguments=()) -> str:
         ("icp.error_metric", "fast", "must be one of point_to_plane, point_to_point: 'fast'"),
         ("node.ceiling", ".nan", "node.ceiling must be in [1e-06, 1000]: nan"),
         ("grid.n_cells", "[5, 5, 5]", "parameters grid.* must be the model's"),
+        ("node.covariance_mode", "best", "must be one of cello3d, fused, sigma_points, censi, "),
+        ("node.floor_sigma_m", "50.0", "must be below the root of parameter node.ceiling, 30: 50"),
     ],
 )
 def test_a_bad_parameter_is_named_with_its_value_and_what_is_allowed(
@@ -67,7 +69,12 @@ def test_a_truncated_model(tmp_path, domain_id, model_path, n_bytes) -> None:
 def test_a_signal_ends_a_running_node_with_status_0(
     tmp_path, domain_id, model_path, number
 ) -> None:
-    parameters = {"node.model": model_path, "icp.trim": 0.5, "icp.trim_ratio": 0.8}
+    parameters = {
+        "node.model": model_path,
+        "icp.trim": 0.5,
+        "icp.trim_ratio": 0.8,
+        "sampling.variance": 0.1,
+    }
     with NodeProcess(tmp_path / "log", domain_id, parameters) as process:
         player = Player(domain_id, check=process.check)
         running = player.spin_until(lambda: bool(player.replay.last_status), 60.0)
@@ -78,6 +85,7 @@ def test_a_signal_ends_a_running_node_with_status_0(
         output = process.output()
     assert "unknown parameter icp.trim has no effect" in output
     assert "not as the model was trained: icp.trim_ratio is 0.8, not 0.7" in output
+    assert "not as the model was trained: sampling.variance is 0.1, not 0.05" in output
     assert "Traceback" not in output
 
 

@@ -12,6 +12,7 @@ from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import compound_right, is_positive_definite
 from cello3d_ros.registration.icp import Registration
 from cello3d_ros.ros import tracker as module
+from cello3d_ros.ros.covariances import CovarianceError
 from cello3d_ros.ros.guess import Place
 from cello3d_ros.ros.tracker import (
     BrokenChainError,
@@ -33,7 +34,9 @@ def asked(monkeypatch):
     guesses: list[np.ndarray] = []
     instead: list[Exception | bool] = []
 
-    def estimate(reading, reference, T_init, model, pipeline, rng, method, settings, registration):
+    def estimate(
+        reading, reference, T_init, model, pipeline, rng, method, settings, registration, n_threads
+    ):
         guesses.append(T_init)
         fate = instead.pop(0) if instead else True
         if isinstance(fate, Exception):
@@ -368,3 +371,18 @@ def test_a_scan_is_found_in_a_map_by_icp(asked, monkeypatch) -> None:
         answer = tracker.step(i * S, scan, Place(IN_MAP @ shift(0.1)))
         error = se3.log(se3.inverse(IN_MAP) @ answer.T_odom_read)
         assert np.abs(error).max() < 0.02
+
+
+@pytest.mark.parametrize("scale", [1e-6, 0.3, 1.0, 1e3, 1e12])
+def test_a_chain_grows_by_its_steps_and_not_by_itself(scale: float) -> None:
+    """Standing still adds covariances; 4th order alone would reach 1e27 for scale 1."""
+    T, Y = np.eye(4), np.zeros((6, 6))
+    for _ in range(400):
+        T, Y = module._extended(T, Y, np.eye(4), scale * np.eye(6))
+    assert is_positive_definite(Y)
+    assert 399 * scale < Y[0, 0] < 2 * 400 * scale
+    assert se3.is_rigid(T)
+
+
+def test_a_covariance_that_cannot_be_published_has_a_reason_of_its_own() -> None:
+    assert reason_of(CovarianceError("not finite")) == "covariance"

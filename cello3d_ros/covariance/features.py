@@ -1,0 +1,126 @@
+"""Global features: a few numbers about a registered pair that need no history of ICP.
+
+They follow from the associations at the registered pose, whoever registered, and do not change
+when both clouds are turned about the sensor.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from cello3d_ros.clouds.neighbors import Indices
+from cello3d_ros.clouds.shape import Cloud
+from cello3d_ros.config import IcpConfig
+from cello3d_ros.geometry.se3 import Array, transform
+from cello3d_ros.registration.overlap import Overlap
+
+#: What ``global_features`` returns, in its order; logarithms are natural.
+FEATURES = (
+    "overlap_ratio",
+    "log_sandwich_m",
+    "log_sandwich_rad",
+    "log_trim_m",
+    "log_residual_m",
+    "log_condition",
+    "log_least_sandwich_against_hessian",
+    "log_mean_sandwich_against_hessian",
+    "log_largest_sandwich_against_hessian",
+    "log_associations",
+    "log_reading_points_per_draw",
+    "log_reference_points_per_draw",
+    "log_motion_m",
+)
+KINDS = ("descriptor", "global", "both")  # what a model may look at
+_MOTION_M = 0.1  # added to the distance of the two sensors, so that its logarithm is bounded
+
+
+def global_features(
+    reading: Cloud,
+    reference: Cloud,
+    T_ref_read: Array,
+    overlap: Overlap,
+    shapes: dict[str, Array],
+    config: IcpConfig,
+) -> Array:
+    """Return the numbers that ``FEATURES`` names.
+
+    The share of the reading that overlaps; the standard deviation of the sandwich in translation
+    and in rotation; the distance up to which ICP keeps associations, their root mean square
+    point-to-plane residual, their number; the condition of H in units in which the mean variances
+    of translation and of rotation are 1; the least, geometric mean and largest eigenvalue of the
+    sandwich against ``rms^2 H^-1``, which independent residuals would make; how many points stand
+    behind each that ICP draws, in either cloud; the distance of the two sensors.
+    """
+    limit, rms, n = _residuals(reading, reference, T_ref_read, overlap, config)
+    S, H_inverse = shapes["sandwich"], shapes["hessian"]
+    spread = np.sqrt([np.trace(S[:3, :3]), np.trace(S[3:, 3:])])
+    traces = np.trace(H_inverse[:3, :3]), np.trace(H_inverse[3:, 3:])
+    unit = np.repeat(np.sqrt(3.0 / np.array(traces)), 3)
+    variances, vectors = np.linalg.eigh(H_inverse * np.outer(unit, unit))
+    root = unit[:, None] * vectors / np.sqrt(variances)  # root^T H^-1 root = I
+    ratios = np.maximum(np.linalg.eigvalsh(root.T @ S @ root), 1e-300) / rms**2
+    against = ratios[0], np.exp(np.log(ratios).mean()), ratios[-1]
+    drawn = (
+        len(reading.points) / min(len(reading.points), config.n_reading_points),
+        len(reference.points) / min(len(reference.points), config.n_reference_points),
+    )
+    motion = np.linalg.norm(T_ref_read[:3, 3]) + _MOTION_M
+    logs = np.log([*spread, limit, rms, variances[-1] / variances[0], *against, n, *drawn, motion])
+    return np.concatenate([[overlap.ratio], logs])
+
+
+def model_inputs(kind: str, descriptors: Array, features: Array) -> Array:
+    """Return what a model looks at of a pair, or of many.
+
+    kind: one of ``KINDS``; descriptors: (..., R, D), the first as recorded, the others turned
+    about z; features: (..., G).  Returns (..., R, D) for "descriptor", (..., 1, G) or
+    (..., 1, G + D) otherwise: global features do not tell the turns of a pair apart.
+    """
+    if kind == "descriptor":
+        return descriptors
+    row = np.asarray(features)[..., None, :]
+    return row if kind == "global" else np.concatenate([row, descriptors[..., :1, :]], axis=-1)
+
+
+def _residuals(
+    reading: Cloud, reference: Cloud, T_ref_read: Array, overlap: Overlap, config: IcpConfig
+) -> tuple[float, float, int]:
+    """Return the trim limit, and rms residual and number of the associations within it."""
+    distances2 = overlap.distances2
+    rank = min(int(distances2.size * config.trim_ratio), distances2.size - 1)
+    limit2 = float(np.partition(distances2, rank, axis=None)[rank])
+    total, n = _sum_residuals(
+        transform(T_ref_read, reading.points),
+        reference.points,
+        reference.normals,
+        distances2,
+        overlap.indices,
+        limit2,
+    )
+    # of exact copies nothing is left: 1 um stands for it
+    return max(np.sqrt(limit2), 1e-6), max(np.sqrt(total / n), 1e-6), n
+
+
+@njit(cache=True, nogil=True)
+def _sum_residuals(
+    moved: Array,
+    points: Array,
+    normals: Array,
+    distances2: Array,
+    indices: Indices,
+    limit2: float,
+) -> tuple[float, int]:
+    """Return the sum of squared point-to-plane residuals within the limit, and their number."""
+    total, n = 0.0, 0
+    for i in range(len(moved)):
+        for j in range(indices.shape[1]):
+            if not distances2[i, j] <= limit2:
+                break
+            q = indices[i, j]
+            r = 0.0
+            for a in range(3):
+                r += (moved[i, a] - points[q, a]) * normals[q, a]
+            total += r * r
+            n += 1
+    return total, n

@@ -1,0 +1,90 @@
+"""Global features: by their definitions, and under a change of frame."""
+
+import numpy as np
+import pytest
+
+from cello3d_ros.clouds.shape import prepare
+from cello3d_ros.config import CloudConfig, IcpConfig, Pipeline
+from cello3d_ros.covariance.description import describe, turns
+from cello3d_ros.covariance.features import FEATURES, model_inputs
+from cello3d_ros.geometry.se3 import exp, inverse, transform
+
+T_HAT = exp([0.4, -0.3, 0.05, 0.02, 0.05, 0.6])
+
+
+@pytest.fixture
+def pair(room):
+    rng = np.random.default_rng(33)
+    reading = prepare(transform(inverse(T_HAT), room[0]), CloudConfig(), rng)
+    return reading, prepare(room[1], CloudConfig(), rng)
+
+
+def by_name(description):
+    assert description.features.shape == (len(FEATURES),)
+    return dict(zip(FEATURES, description.features, strict=True))
+
+
+def test_each_feature_is_what_it_is_called(pair):
+    reading, reference = pair
+    icp = IcpConfig(n_reading_points=500, n_reference_points=10**6)
+    found = describe(reading, reference, T_HAT, Pipeline(icp=icp))
+    features = by_name(found)
+    d2, idx = found.overlap.distances2, found.overlap.indices
+    limit2 = np.sort(d2, axis=None)[int(d2.size * icp.trim_ratio)]
+    kept = d2 <= limit2
+    q, n = reference.points[idx], reference.normals[idx]
+    r = (((transform(T_HAT, reading.points)[:, None] - q) * n).sum(axis=2))[kept]
+    S, H_inverse = found.shapes["sandwich"], found.shapes["hessian"]
+    diagonal = np.diag(H_inverse)
+    unit = np.sqrt(np.repeat([diagonal[:3].mean(), diagonal[3:].mean()], 3))
+    against = np.log(np.linalg.eigvals(np.linalg.solve(H_inverse, S)).real / np.mean(r**2))
+    expected = {
+        "overlap_ratio": found.overlap_ratio,
+        "log_sandwich_m": 0.5 * np.log(np.trace(S[:3, :3])),
+        "log_sandwich_rad": 0.5 * np.log(np.trace(S[3:, 3:])),
+        "log_trim_m": 0.5 * np.log(limit2),
+        "log_residual_m": 0.5 * np.log(np.mean(r**2)),
+        "log_condition": np.log(np.linalg.cond(H_inverse / np.outer(unit, unit))),
+        "log_least_sandwich_against_hessian": against.min(),
+        "log_mean_sandwich_against_hessian": against.mean(),
+        "log_largest_sandwich_against_hessian": against.max(),
+        "log_associations": np.log(kept.sum()),
+        "log_reading_points_per_draw": np.log(len(reading.points) / 500),
+        "log_reference_points_per_draw": 0.0,
+        "log_motion_m": np.log(0.1 + np.linalg.norm(T_HAT[:3, 3])),
+    }
+    assert set(expected) == set(FEATURES)
+    for name, value in expected.items():
+        assert features[name] == pytest.approx(value, rel=1e-6, abs=1e-9), name
+
+
+def test_features_stay_when_the_sensor_frame_is_turned(pair):
+    reading, reference = pair
+    R = np.eye(4)
+    R[:3, :3] = turns(5)[1]
+
+    def turned(cloud):
+        return prepare(transform(R, cloud.points), whole, np.random.default_rng(0))
+
+    # every point kept, so that both clouds have the same points before and after
+    whole = CloudConfig(voxel_m=0.01, min_range_m=0.0)
+    here = describe(
+        *(prepare(cloud.points, whole, np.random.default_rng(0)) for cloud in pair),
+        T_HAT,
+        Pipeline(),
+    )
+    there = describe(turned(reading), turned(reference), R @ T_HAT @ inverse(R), Pipeline())
+    np.testing.assert_allclose(here.features, there.features, atol=2e-3)
+
+
+def test_identical_clouds_have_finite_features(pair):
+    assert np.isfinite(describe(pair[0], pair[0], np.eye(4), Pipeline()).features).all()
+
+
+def test_inputs_are_the_turned_descriptors_or_one_row():
+    descriptors, features = np.arange(24.0).reshape(2, 3, 4), np.array([[7.0, 8.0], [9.0, 10.0]])
+    np.testing.assert_array_equal(model_inputs("descriptor", descriptors, features), descriptors)
+    np.testing.assert_array_equal(model_inputs("global", descriptors, features), features[:, None])
+    both = model_inputs("both", descriptors, features)
+    assert both.shape == (2, 1, 6)
+    np.testing.assert_array_equal(both[1, 0], [9.0, 10.0, 12.0, 13.0, 14.0, 15.0])
