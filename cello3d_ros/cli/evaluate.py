@@ -131,7 +131,8 @@ def run(arguments: argparse.Namespace) -> None:
     keys = _accepted(datasets, names)
     predictions = from_dataset(model, examples, mean, settings)
     _add_online(predictions, keys, recordings, model, settings, arguments)
-    report = {"model": str(path), "shape": model.shape, "settings": settings._asdict()}
+    assumed = {name: getattr(settings, name) for name in ("sigma_m", "n_registrations")}
+    report = {"model": str(path), "shape": model.shape, "settings": assumed}
     report |= _pairs_report(predictions, examples, keys, settings, arguments.exact_poses)
     report["trajectories"] = _trajectories(recordings, model, arguments)
     print("\n".join(_tables(report)))

@@ -24,7 +24,7 @@ from cello3d_ros.geometry.se3 import Array
 
 _FAR2 = 1.7e308  # no finite squared distance is searched for beyond
 _LEAST2 = 1e-290  # from where a radius grows that was guessed to be nothing
-_FEW = 8  # distances left to choose among by sorting
+_FEW = 4  # distances left to choose among by sorting
 _TRIES = 12  # thresholds tried before that
 
 
