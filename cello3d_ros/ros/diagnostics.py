@@ -99,7 +99,13 @@ class Statistics:
         self._answer = _described(answer, C)
 
     def message(
-        self, name: str, now_ns: int, config: NodeConfig, n_restarts: int, n_clock_jumps: int
+        self,
+        name: str,
+        now_ns: int,
+        config: NodeConfig,
+        n_restarts: int,
+        last_restart: str,
+        n_clock_jumps: int,
     ) -> DiagnosticArray:
         """Return the message of now: level, one sentence, keys and values."""
         verdict = self._judged(config.max_failures)
@@ -119,6 +125,7 @@ class Statistics:
             "odometry_rejected": str(self.counts["odometry_rejected"]),
             "clock_jumps": str(n_clock_jumps),
             "chain_restarts": str(n_restarts),
+            "last_restart": last_restart,
             "model": self._model_name,
             "covariance_mode": config.covariance_mode,
             "rate_hz.received": f"{_rate_hz(self._received_s):.2f}",
@@ -167,6 +174,17 @@ def _described(answer: Answer, C: Array) -> dict[str, str]:
         "weakest_rotation": _numbers(turns[:, 0], "{:.3f}"),
         "weakest_eigenvalue": f"{eigenvalues[0]:.6g}",
         "eigenvalues": _numbers(eigenvalues, "{:.4g}"),
+        **_offset(answer.offset),
+    }
+
+
+def _offset(offset: Array | None) -> dict[str, str]:
+    """Return how far ICP would move an external pose."""
+    if offset is None:
+        return {}
+    return {
+        "external_offset_m": f"{np.linalg.norm(offset[:3]):.4f}",
+        "external_offset_rad": f"{np.linalg.norm(offset[3:]):.5f}",
     }
 
 

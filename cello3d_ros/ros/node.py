@@ -250,6 +250,7 @@ class CovarianceNode(ManagedNode):
                 self._now_ns(),
                 self._config.node,
                 self._worker.n_restarts,
+                self._worker.last_restart,
                 self._worker.n_clock_jumps,
             )
         )

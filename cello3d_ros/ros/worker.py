@@ -64,6 +64,11 @@ class Worker:
         return self._tracker.n_restarts
 
     @property
+    def last_restart(self) -> str:
+        """Why the last one was given up."""
+        return self._tracker.last_restart
+
+    @property
     def has_work(self) -> bool:
         """Whether a cloud waits, with or without its odometry."""
         return len(self._intake) > 0
@@ -100,10 +105,8 @@ class Worker:
                 self._warn("transform", sentence)
 
     def hear_reference(self, message: PointCloud2) -> None:
-        """Register to this cloud from now on; one that comes twice is the same one."""
+        """Register to this cloud from now on."""
         stamp_ns, frame_id = messages.stamp_ns_of(message), message.header.frame_id
-        if self._tracker.map_stamp_ns == stamp_ns and self._locator.map_frame == frame_id:
-            return
         try:
             points = _points(message, MAX_MAP_BYTES)
             if not frame_id or not len(points):
