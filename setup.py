@@ -12,6 +12,7 @@ OPEN3D = [
 CLUSTER = ["distributed>=2024.1"]
 SMALL_GICP = ["small_gicp>=1.0"]
 REPORT = ["plotly>=6"]  # maintained; its 3-D views work in one file without a network
+BENCH = ["kiss-icp>=1.2"]  # what benchmarks/online.py compares with
 TEST = [
     "pytest",
     "scikit-learn>=1.3",
@@ -53,6 +54,7 @@ setup(
         "small_gicp": SMALL_GICP,
         "report": REPORT,
         "test": TEST,
+        "bench": BENCH,
         "dev": [*TEST, "ruff", "mypy", "import-linter", "types-PyYAML", "playwright"],
     },
     data_files=[

@@ -189,6 +189,9 @@ class NodeConfig(Section):
     reference_range_m: float = _setting(
         60.0, "points of reference_points used around the sensor", 1.0, 1e4
     )
+    max_reference_points: int = _setting(
+        50_000, "more points of them are thinned out", 1000, 10_000_000
+    )
     registration: str = _setting(
         "icp",
         "who registers: this node, or another program (external_odometry or external_pose)",
@@ -196,6 +199,9 @@ class NodeConfig(Section):
     )
     external_tolerance_s: float = _setting(
         1e-3, "largest distance in time of an external pose and its cloud", 0.0, 1.0
+    )
+    max_external_offset: float = _setting(
+        0.5, "an external pose that ICP would move farther (m, rad) is refused; 0 is no look", 0.0
     )
     guess_without_odometry: str = _setting(
         "skip",
@@ -229,7 +235,7 @@ class NodeConfig(Section):
         1.0,
     )
     inflate_unknown: bool = _setting(
-        True, "widen the covariance of an unknown pair to the mean of the model's examples"
+        True, "widen the model's prediction for an unknown pair to the mean of its examples"
     )
     warn_sigma_m: float = _setting(0.3, "3 sigma along the weakest axis that warns", 0.0)
     error_sigma_m: float = _setting(1.0, "3 sigma along the weakest axis that is an error", 0.0)

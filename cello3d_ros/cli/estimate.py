@@ -26,6 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model", metavar="M", default="general", help="model file, or a shipped model's name"
     )
+    parser.add_argument(
+        "--method",
+        choices=("model", "fused", "sigma_points", "censi", "hessian", "constant"),
+        default="model",
+        help="what says how far the registration is to be trusted",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the random subsamples")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
@@ -48,7 +54,9 @@ def run(arguments: argparse.Namespace) -> None:
             raise CloudError(f"{path}: {error}") from None
 
     reading, reference = cloud(arguments.reading), cloud(arguments.reference)
-    answer = as_dict(estimate(reading, reference, T_init, model, model.pipeline, rng))
+    answer = as_dict(
+        estimate(reading, reference, T_init, model, model.pipeline, rng, arguments.method)
+    )
     print(json.dumps(answer, indent=2) if arguments.json else _as_text(answer))
 
 
@@ -71,7 +79,9 @@ def as_dict(estimate: Estimate) -> dict[str, Any]:
         "converged": registration.converged,
         "residual_rms_m": registration.residual_rms_m,
         "associations": registration.n_associations,
+        "method": estimate.method,
         "nearest_rho": estimate.nearest_rho,
+        "novelty": estimate.novelty,
         "effective_neighbours": estimate.effective_neighbors,
     }
 
@@ -90,7 +100,8 @@ def _as_text(answer: dict[str, Any]) -> str:
             f"ICP {state} after {answer['iterations']} iterations, "
             f"{answer['overlap_ratio']:.0%} of the reading overlaps",
             f"nearest example at rho {answer['nearest_rho']:.3g}, "
-            f"{answer['effective_neighbours']:.1f} effective neighbours",
+            f"{answer['effective_neighbours']:.1f} effective neighbours, novelty "
+            f"{answer['novelty']:.2f}",
         ]
     )
 

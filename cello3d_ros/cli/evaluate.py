@@ -131,10 +131,8 @@ def run(arguments: argparse.Namespace) -> None:
     keys = _accepted(datasets, names)
     predictions = from_dataset(model, examples, mean, settings)
     _add_online(predictions, keys, recordings, model, settings, arguments)
-    report: dict[str, Any] = {"model": str(path), "shape": model.shape}
-    report["settings"] = {  # JSON has no infinity: what has no limit is left out
-        name: value for name, value in settings._asdict().items() if np.isfinite(value)
-    }
+    assumed = {name: getattr(settings, name) for name in ("sigma_m", "n_registrations")}
+    report: dict[str, Any] = {"model": str(path), "shape": model.shape, "settings": assumed}
     report |= _pairs_report(predictions, examples, keys, settings, arguments.exact_poses)
     report["worst_pairs"] = _worst_pairs(datasets, report["pairs"], keys, predictions)
     report["trajectories"] = _trajectories(recordings, model, arguments)

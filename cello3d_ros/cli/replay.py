@@ -106,12 +106,12 @@ def _recorded(
         yield (
             f"{_PREFIX}/relative_pose",
             stamp_ns,
-            make.pose_with_covariance(T_ref_read, C, stamp_ns, "lidar"),
+            make.pose_with_covariance(T_ref_read, C, stamp_ns, answer.frame_id),
         )
         yield (
             f"{_PREFIX}/pose",
             stamp_ns,
-            make.pose_with_covariance(answer.T_odom_read, C_chain, stamp_ns, "odom"),
+            make.pose_with_covariance(answer.T_odom_read, C_chain, stamp_ns, answer.pose_frame_id),
         )
 
 

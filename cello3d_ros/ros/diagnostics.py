@@ -66,10 +66,12 @@ class Statistics:
         self._last_event, self._last_stamp_ns = WAITING if is_listening else INACTIVE, 0
         self._n_failed_in_a_row = 0
 
-    def receive(self) -> None:
-        """Count a cloud that came."""
-        self.counts["received"] += 1
-        self._received_s.append(time.monotonic())
+    def receive(self, n_unheard: int = 0) -> None:
+        """Count a cloud that came, and those before it that came but could not be heard."""
+        self.counts["received"] += 1 + n_unheard
+        if n_unheard:
+            self.dropped["unheard"] += n_unheard
+        self._received_s.extend([time.monotonic()] * (1 + n_unheard))
 
     def fail(self, stamp_ns: int, reason: str, sentence: str) -> None:
         """Count a cloud without an answer."""
@@ -97,7 +99,13 @@ class Statistics:
         self._answer = _described(answer, C)
 
     def message(
-        self, name: str, now_ns: int, config: NodeConfig, n_restarts: int, n_clock_jumps: int
+        self,
+        name: str,
+        now_ns: int,
+        config: NodeConfig,
+        n_restarts: int,
+        last_restart: str,
+        n_clock_jumps: int,
     ) -> DiagnosticArray:
         """Return the message of now: level, one sentence, keys and values."""
         verdict = self._judged(config.max_failures)
@@ -117,6 +125,7 @@ class Statistics:
             "odometry_rejected": str(self.counts["odometry_rejected"]),
             "clock_jumps": str(n_clock_jumps),
             "chain_restarts": str(n_restarts),
+            "last_restart": last_restart,
             "model": self._model_name,
             "covariance_mode": config.covariance_mode,
             "rate_hz.received": f"{_rate_hz(self._received_s):.2f}",
@@ -156,6 +165,7 @@ def _described(answer: Answer, C: Array) -> dict[str, str]:
         "iterations": str(found.registration.n_iterations),
         "associations": str(found.registration.n_associations),
         "nearest_rho": f"{found.nearest_rho:.6g}",
+        "novelty": f"{found.novelty:.3f}",
         "effective_neighbors": f"{found.effective_neighbors:.3f}",
         "out_of_distribution": str(found.is_unknown).lower(),
         "long_axis_3_sigma_m": f"{N_SIGMA * sigma_m[0]:.6g}",
@@ -165,6 +175,17 @@ def _described(answer: Answer, C: Array) -> dict[str, str]:
         "weakest_rotation": _numbers(turns[:, 0], "{:.3f}"),
         "weakest_eigenvalue": f"{eigenvalues[0]:.6g}",
         "eigenvalues": _numbers(eigenvalues, "{:.4g}"),
+        **_offset(answer.offset),
+    }
+
+
+def _offset(offset: Array | None) -> dict[str, str]:
+    """Return how far ICP would move an external pose."""
+    if offset is None:
+        return {}
+    return {
+        "external_offset_m": f"{np.linalg.norm(offset[:3]):.4f}",
+        "external_offset_rad": f"{np.linalg.norm(offset[3:]):.5f}",
     }
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cello3d_ros.clouds.filters import crop_range, limit_density, subsample
 from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import CloudConfig, NodeConfig
 from cello3d_ros.errors import CloudError, NoOverlapError
@@ -14,6 +15,7 @@ from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.ros.guess import Place
 
 _MOVED = 0.25  # share of the range after which the map is cropped anew
+_SPARE = 10  # of so many times the points that are kept density is made even
 
 
 @dataclass(frozen=True)
@@ -58,31 +60,47 @@ class Map:
         self.stamp_ns, self.points, self.frame_id = stamp_ns, points, frame_id
         self._cloud: Cloud | None = None
         self._centre = np.zeros(3)
-        self._made_with: tuple[float, CloudConfig, int] | None = None
+        self._made_with: tuple[float, int, CloudConfig, int] | None = None
+
+    def is_same(self, other: Map) -> bool:
+        """Return whether another message says the same."""
+        mine, theirs = ((m.stamp_ns, m.frame_id, m.points.shape) for m in (self, other))
+        return mine == theirs and np.array_equal(self.points, other.points)
 
     def around(
-        self, position: Array, range_m: float, config: CloudConfig, seed: int
+        self, position: Array, node: NodeConfig, config: CloudConfig
     ) -> tuple[Cloud, Array]:
         """Return the prepared points around a position and T_map_crop, the frame they are in.
 
         That frame has the axes of the map and its origin at a place at most a quarter of
-        ``range_m`` from the position.  position: (3,).  Raises NoOverlapError.
+        ``reference_range_m`` from the position.  position: (3,).  Raises NoOverlapError.
         """
-        made_with = (range_m, config, seed)
+        range_m, n_points = node.reference_range_m, node.max_reference_points
+        made_with = (range_m, n_points, config, node.seed)
         moved_m = np.linalg.norm(position - self._centre)
         if self._cloud is None or moved_m > _MOVED * range_m or made_with != self._made_with:
             self._cloud = None
-            self._cloud = self._prepared(position, range_m, config, seed)
+            rng = np.random.default_rng([node.seed, self.stamp_ns & (2**64 - 1)])
+            self._cloud = self._prepared(position, range_m, n_points, config, rng)
             self._centre, self._made_with = np.array(position), made_with
         return self._cloud, se3.pose(self._centre, [0.0, 0.0, 0.0, 1.0])
 
-    def _prepared(self, centre: Array, range_m: float, config: CloudConfig, seed: int) -> Cloud:
-        rng = np.random.default_rng([seed, self.stamp_ns & (2**64 - 1)])
+    def _prepared(
+        self,
+        centre: Array,
+        range_m: float,
+        n_points: int,
+        config: CloudConfig,
+        rng: np.random.Generator,
+    ) -> Cloud:
+        """Return what is within range of a centre, even in density and no more than that many."""
         low, high = centre - range_m, centre + range_m
-        near = self.points[((self.points >= low) & (self.points <= high)).all(axis=1)]
+        near = self.points[((self.points >= low) & (self.points <= high)).all(axis=1)] - centre
+        near = crop_range(near[subsample(len(near), _SPARE * n_points, rng)], 0.0, range_m)
+        even = limit_density(near, config.voxel_m, config.max_points_per_voxel, rng)
+        few = even[subsample(len(even), n_points, rng)]
         try:
-            sphere = replace(config, min_range_m=0.0, max_range_m=range_m)
-            return prepare(near - centre, sphere, rng)
+            return prepare(few, replace(config, min_range_m=0.0, max_range_m=range_m), rng)
         except CloudError as error:
             raise NoOverlapError(
                 f"the reference cloud around the guess of the sensor is too small: {error}"

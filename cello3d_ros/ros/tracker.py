@@ -13,7 +13,7 @@ import numpy as np
 
 from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import NodeConfig, Pipeline
-from cello3d_ros.covariance.estimator import Estimate, estimate, registered_elsewhere
+from cello3d_ros.covariance.estimator import Estimate, estimate
 from cello3d_ros.covariance.methods import METHODS, MethodSettings
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.covariance.novelty import rho_limit
@@ -21,6 +21,7 @@ from cello3d_ros.errors import CloudError, ModelError, NoOverlapError, Registrat
 from cello3d_ros.geometry.gaussian import GaussianPose, compound_right, is_positive_definite
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.ros.covariances import CovarianceError
+from cello3d_ros.ros.external import DisagreementError, External, checked
 from cello3d_ros.ros.frames import seen_from_base
 from cello3d_ros.ros.guess import CONSTANT_VELOCITY, EXTERNAL, ODOMETRY, Motion, Place
 from cello3d_ros.ros.pairing import Frame, Link, Map, makes_keyframe
@@ -55,7 +56,8 @@ class Answer:
 
     T_odom_read: (4, 4), the accumulated pose; its covariance Y_chain: (6, 6), reading side.
     frame_id, pose_frame_id: the frames of the registration and of the accumulated pose;
-    child_frame_id: whose pose they are.  guess: where the first guess came from.
+    child_frame_id: whose pose they are.  guess: where the first guess came from.  offset: (6,),
+    the twist by which ICP would move an external pose, else None.
     """
 
     stamp_ns: int
@@ -67,6 +69,7 @@ class Answer:
     pose_frame_id: str = "odom"
     child_frame_id: str = "lidar"
     guess: str = ODOMETRY
+    offset: Array | None = None
 
 
 class Tracker:
@@ -84,11 +87,6 @@ class Tracker:
         self._motion = Motion()
         self._T_map_odom: Array = _ORIGIN
 
-    @property
-    def map_stamp_ns(self) -> int | None:
-        """Stamp of the reference cloud that came last, or None."""
-        return None if self._map is None else self._map.stamp_ns
-
     def reset(self, reason: str = "") -> None:
         """Forget the reference and the chain; the next scan starts anew.  A map stays."""
         if self._reference is not None:
@@ -100,10 +98,16 @@ class Tracker:
         self.n_failures = 0
 
     def take_map(self, stamp_ns: int, points: Array, frame_id: str) -> None:
-        """Register scans to this cloud from now on.  points: (N, 3), in the frame ``frame_id``."""
+        """Register scans to this cloud from now on.  points: (N, 3), in the frame ``frame_id``.
+
+        One that comes again, as it does by two subscriptions, is not prepared again.
+        """
+        new = Map(stamp_ns, points, frame_id)
         if self._map is None or self._map.frame_id != frame_id:
             self.reset("the frame of the reference cloud changed")
-        self._map = Map(stamp_ns, points, frame_id)
+        elif self._map.is_same(new):
+            return
+        self._map = new
 
     def step(self, stamp_ns: int, points: Array, place: Place) -> Answer | None:
         """Register a scan to the reference; it becomes the reference, or not, by ``pairing``.
@@ -165,32 +169,43 @@ class Tracker:
             T_map_sensor = self._motion.at(frame.stamp_ns)
         else:
             T_map_sensor = T_map_odom @ frame.T_odom_sensor
-        cloud, T_map_crop = self._map.around(
-            T_map_sensor[:3, 3],
-            self.config.reference_range_m,
-            self.pipeline.cloud,
-            self.config.seed,
-        )
+        cloud, T_map_crop = self._map.around(T_map_sensor[:3, 3], self.config, self.pipeline.cloud)
         T_odom_crop = inverse(T_map_odom) @ T_map_crop
         crop = Frame(self._map.stamp_ns, cloud, frame.place, T_odom_crop)
         return Link(crop, T_map_crop, np.zeros((6, 6)))
 
     def _answer(self, reading: Frame, reference: Link, rng: np.random.Generator) -> Answer:
         T_init, guess = self._guess(reading, reference)
+        clouds = reading.cloud, reference.frame.cloud
+        external: External | None = None
+        if guess == EXTERNAL:
+            limit = self.config.max_external_offset
+            external = checked(*clouds, T_init, self.pipeline.icp, limit, rng)
         found = estimate(
-            *(reading.cloud, reference.frame.cloud, T_init, self.model, self.pipeline, rng),
+            *(*clouds, T_init, self.model, self.pipeline, rng),
             method=METHOD_OF[self.config.covariance_mode],
             settings=self._settings(),
-            registration=registered_elsewhere(T_init) if guess == EXTERNAL else None,
+            registration=None if external is None else external.registration,
             n_threads=_N_THREADS,
         )
+        if external is not None:
+            offset = external.offset
+            found = found._replace(covariance=found.covariance + np.outer(offset, offset))
         if not found.registration.converged:
             raise NotConvergedError(
                 f"ICP did not converge in {found.registration.n_iterations} iterations "
                 f"({found.registration.reason})"
             )
         T, Y = _extended(reference.T, reference.Y, found.registration.T_ref_read, found.covariance)
-        return Answer(reading.stamp_ns, reference.frame.stamp_ns, found, T, Y, guess=guess)
+        return Answer(
+            reading.stamp_ns,
+            reference.frame.stamp_ns,
+            found,
+            T,
+            Y,
+            guess=guess,
+            offset=None if external is None else external.offset,
+        )
 
     def _guess(self, reading: Frame, reference: Link) -> tuple[Array, str]:
         """Return the first guess of T_ref_read and where it comes from."""
@@ -281,6 +296,7 @@ def reason_of(error: Exception) -> str:
         TooFarApartError: "too_far_apart",
         BrokenChainError: "broken_chain",
         NoReferenceError: "no_reference",
+        DisagreementError: "external_disagrees",
         NoOverlapError: "no_overlap",
         RegistrationError: "registration",
         ModelError: "beyond_model",

@@ -65,7 +65,7 @@ def test_json_holds_the_same_for_a_machine(
     assert found["path"] == str(path)
     assert found["relative_to"] == "sandwich"
     assert found["kind"] == "model file (.npz)"
-    assert found["format_version"] == 1
+    assert found["format_version"] == 2
     assert found["size_bytes"] == path.stat().st_size
     assert found["provenance"] == PROVENANCE
     assert found["sampling"] == config["sampling"]

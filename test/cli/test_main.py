@@ -46,6 +46,17 @@ def test_estimate_prints_the_pose_and_both_covariances(files, capsys):
     assert answer["effective_neighbours"] == 1.0
 
 
+def test_estimate_is_by_the_method_that_is_named(files, capsys):
+    sizes = {}
+    for method in ("model", "hessian", "fused"):
+        assert main(["estimate", *files, "--json", "--method", method]) == 0
+        answer = json.loads(capsys.readouterr().out)
+        assert answer["method"] == method
+        assert 0.0 <= answer["novelty"] <= 1.0
+        sizes[method] = np.trace(np.reshape(answer["covariance"], (6, 6)))
+    assert len(set(sizes.values())) == 3
+
+
 def test_estimate_is_readable_and_repeats_itself(files, capsys):
     assert main(["estimate", *files]) == 0
     first = capsys.readouterr().out

@@ -132,6 +132,18 @@ def test_the_sensor_is_where_the_node_s_parameter_says(tmp_path: Path, model: Pa
     assert np.allclose(T, start, atol=1e-9)
 
 
+def test_recorded_poses_as_external_registrations_are_the_result(tmp_path, model) -> None:
+    bag = walk(tmp_path / "walk")
+    (tmp_path / "c.yaml").write_text("node: {registration: external}\n")
+    words = ["replay", str(bag), "--model", str(model), "--config", str(tmp_path / "c.yaml")]
+    assert main([*words, "--out", str(tmp_path / "r")]) == 0
+    lines = (tmp_path / "r" / "covariances.jsonl").read_text().splitlines()[1:]
+    drift = np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.002])
+    for i, line in enumerate(map(json.loads, lines), start=1):
+        T = exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.1]) * i) @ exp(drift * i)
+        assert np.allclose(np.reshape(line["T_odom_read"], (4, 4)), T, atol=1e-9)
+
+
 def test_no_answer_at_all_is_an_error_and_leaves_nothing(tmp_path, model, capsys) -> None:
     bag = walk(tmp_path / "walk", holes=tuple(range(N)))
     assert main(["replay", str(bag), "--out", str(tmp_path / "r"), "--model", str(model)]) == 1

@@ -161,7 +161,7 @@ def test_an_older_manifest_without_fingerprints_is_trained_on(
         del facts["fingerprint"]
     (folder / "manifest.json").write_text(json.dumps(manifest))
     cello3d_train(folder, "--out", tmp_path / "model.npz", "--validation", "*_s3")
-    assert load_model(tmp_path / "model.npz").n_examples == 3 * 5 * 2
+    assert load_model(tmp_path / "model.npz").n_examples == 3 * 5
 
 
 def test_a_learning_curve_stands_beside_the_model(folder: Path, tmp_path: Path) -> None:

@@ -16,9 +16,12 @@ import numpy as np
 import pytest
 
 from cello3d_ros.config import CloudConfig, GridConfig, IcpConfig, Pipeline, SamplingConfig
+from cello3d_ros.covariance.features import FEATURES
 from cello3d_ros.covariance.model import (
+    SHIPPED,
     Model,
     constant_model,
+    find_model,
     load_model,
     predict,
     project,
@@ -28,6 +31,7 @@ from cello3d_ros.covariance.model import (
 )
 from cello3d_ros.errors import ModelError
 from cello3d_ros.geometry import gaussian
+from cello3d_ros.geometry.gaussian import is_positive_definite
 from cello3d_ros.geometry.se3 import Array, adjoint, exp
 
 N, D, R = 40, 7, 3
@@ -606,10 +610,35 @@ def test_a_header_of_absurd_size_is_not_parsed(saved: Path) -> None:
         save_model(a_model(provenance={"x": "y" * 2**24}), saved)
 
 
-def test_the_shipped_model_has_its_place_in_the_package() -> None:
-    path = shipped_model_path()
-    assert path.parts[-3:] == ("cello3d_ros", "models", "general.npz")
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_model_is_small_and_says_what_it_was_made_of(name: str) -> None:
+    path = find_model(name)
+    assert path.parts[-3:] == ("cello3d_ros", "models", f"{name}.npz")
     assert path.is_absolute()
+    assert path.stat().st_size < 5_000_000
+    model = load_model(path)
+    assert model.features == "global"
+    assert model.n_features == len(FEATURES)
+    assert model.pipeline == Pipeline()
+    assert is_positive_definite(np.array(model.provenance["mean_covariance"]))
+    tested = {"11", "12", "13", "14"}  # seeds of which docs/models.md has the figures
+    seen = {**model.provenance["recordings"], **model.provenance["validation_recordings"]}
+    assert seen
+    assert not tested & {recording.rsplit("_s", 1)[1] for recording in seen}
+
+
+def test_a_model_is_found_by_name_or_path() -> None:
+    assert find_model("") == find_model("general") == shipped_model_path()
+    assert find_model("my/general.npz") == Path("my/general.npz")
+
+
+def test_the_margin_multiplies_every_prediction() -> None:
+    d = descriptors()[3]
+    F, G = (predict(a_model(margin=margin), d).covariance for margin in (1.0, 1.5))
+    np.testing.assert_allclose(G, 1.5 * F, rtol=1e-12)
+    for margin in (0.0, -1.0, math.inf, math.nan):
+        with pytest.raises(ModelError, match="margin"):
+            a_model(margin=margin)
 
 
 def test_novelty_is_the_share_of_training_pairs_that_were_nearer() -> None:

@@ -324,7 +324,12 @@ def test_the_order_of_the_examples_does_not_change_predictions() -> None:
 
 
 SGD = TrainingConfig(
-    shape="none", theta="diagonal", mean_weight=0.0, regularization=1e-3, optimizer="sgd"
+    features="descriptor",
+    shape="none",
+    theta="diagonal",
+    mean_weight=0.0,
+    regularization=1e-3,
+    optimizer="sgd",
 )
 
 

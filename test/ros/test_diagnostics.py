@@ -40,12 +40,12 @@ def answered(statistics: Statistics, C: np.ndarray, is_unknown: bool = False, **
         *(0.8, C, 0.5, 4.0, "model"),
         is_unknown,
     )
-    answer = Answer(2, 1, found, np.eye(4), C)
+    answer = Answer(2, 1, found, np.eye(4), C, offset=np.zeros(6))
     statistics.answer(answer, C, judged(C, is_unknown, config), 0.0, 3)
 
 
 def said(statistics: Statistics) -> tuple[int, str, dict[str, str]]:
-    status = statistics.message("node: registration", 5, CONFIG, 2, 1).status[0]
+    status = statistics.message("node: registration", 5, CONFIG, 2, "told to", 1).status[0]
     return status.level[0], status.message, {item.key: item.value for item in status.values}
 
 
@@ -63,7 +63,9 @@ def test_the_page_names_every_key_and_no_other(statistics) -> None:
     documented = table("Keys")
     assert after == set(documented)
     assert before == {key for key, when in documented.items() if when == "always"}
-    assert set(documented.values()) == {"always", "after an answer"}
+    assert set(documented.values()) == {
+        *("always", "after an answer", "after an external registration")
+    }
 
 
 def reasons() -> set[str]:
@@ -76,6 +78,8 @@ def reasons() -> set[str]:
                 name = ast.unparse(node.func)
                 words = [node.args[1]] if name == "Skip" else words
                 words = [node.args[0]] if name == "self._forget" else words
+            elif isinstance(node, ast.Subscript) and ast.unparse(node.value) == "self.dropped":
+                words = [node.slice]
             elif isinstance(node, ast.FunctionDef) and node.name in ("reason_of", "stamp_order"):
                 words = list(ast.walk(node))
             found |= {word.value for word in words if isinstance(word, ast.Constant)}

@@ -11,8 +11,11 @@ from cello3d_ros.errors import CloudError, NoOverlapError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import compound_right, is_positive_definite
 from cello3d_ros.registration.icp import Registration
+from cello3d_ros.ros import external as external_module
+from cello3d_ros.ros import pairing
 from cello3d_ros.ros import tracker as module
 from cello3d_ros.ros.covariances import CovarianceError
+from cello3d_ros.ros.external import DisagreementError
 from cello3d_ros.ros.guess import Place
 from cello3d_ros.ros.tracker import (
     BrokenChainError,
@@ -287,22 +290,50 @@ def test_an_extrapolated_scan_is_put_where_its_registration_says(asked, monkeypa
     np.testing.assert_allclose(asked[0][1] @ se3.inverse(moved), shift(0.9), atol=1e-12)
 
 
-def test_an_external_registration_is_the_result_and_icp_is_not_run(monkeypatch) -> None:
+STEP = se3.exp([0.1, 0.05, 0.0, 0.0, 0.0, 1.0])
+
+
+def external(tracker: Tracker, error: np.ndarray):
+    """Two scans of a room, a step apart, and external poses with an error in the second."""
+    rng = np.random.default_rng(4)
+    scans = [se3.transform(se3.inverse(T), room(rng)) for T in (np.eye(4), STEP)]
+    tracker.step(0, scans[0], Place(POSES[2], guess="external"))
+    return tracker.step(S, scans[1], Place(POSES[2] @ STEP @ error, guess="external"))
+
+
+def test_an_external_registration_is_the_result_and_icp_need_not_be_run(monkeypatch) -> None:
     def register(*_):
         raise AssertionError("ICP was run")
 
     monkeypatch.setattr(estimator, "register", register)
-    tracker = tracker_with(registration="external")
-    rng, step = np.random.default_rng(4), se3.exp([0.1, 0.05, 0.0, 0.0, 0.0, 0.04])
-    scans = [se3.transform(se3.inverse(T), room(rng)) for T in (np.eye(4), step)]
-    places = [Place(POSES[2] @ T, guess="external") for T in (np.eye(4), step)]
-    tracker.step(0, scans[0], places[0])
-    answer = tracker.step(S, scans[1], places[1])
+    monkeypatch.setattr(external_module, "register", register)
+    tracker = tracker_with(registration="external", max_external_offset=0.0)
+    answer = external(tracker, np.eye(4))
     found = answer.estimate.registration
-    np.testing.assert_allclose(found.T_ref_read, step, atol=1e-12)
+    np.testing.assert_allclose(found.T_ref_read, STEP, atol=1e-12)
     assert (found.n_iterations, found.converged, answer.guess) == (0, True, "external")
     np.testing.assert_allclose(answer.estimate.covariance, WIDE, atol=1e-12)
-    np.testing.assert_allclose(answer.T_odom_read, POSES[2] @ step, atol=1e-12)
+    np.testing.assert_allclose(answer.T_odom_read, POSES[2] @ STEP, atol=1e-12)
+
+
+def test_covariance_of_an_external_pose_has_the_way_that_icp_would_move_it() -> None:
+    error = np.array([0.05, 0.0, -0.03, 0.0, 0.02, 0.01])
+    answer = external(tracker_with(registration="external"), se3.exp(error))
+    found = answer.estimate
+    np.testing.assert_allclose(found.registration.T_ref_read, STEP @ se3.exp(error), atol=1e-12)
+    np.testing.assert_allclose(answer.offset, -error, atol=0.01)
+    extra = found.covariance - WIDE
+    np.testing.assert_allclose(extra, np.outer(answer.offset, answer.offset), atol=1e-12)
+    np.testing.assert_allclose(answer.Y_chain, found.covariance, atol=1e-12)
+    assert 0.0 < found.registration.residual_rms_m < 0.1
+    assert found.registration.n_associations > 100
+
+
+def test_an_external_pose_that_icp_would_move_far_is_refused() -> None:
+    far = se3.exp([0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
+    with pytest.raises(DisagreementError, match=r"by 0\.\d+ m and .* more than 0\.2") as caught:
+        external(tracker_with(registration="external", max_external_offset=0.2), far)
+    assert reason_of(caught.value) == "external_disagrees"
 
 
 def test_at_the_base_the_chain_is_that_of_the_base(asked) -> None:
@@ -342,6 +373,17 @@ def test_a_scan_is_registered_to_the_map_in_the_frame_of_the_map(asked) -> None:
         np.testing.assert_allclose(answer.T_odom_read, T, atol=1e-9)
         np.testing.assert_allclose(answer.Y_chain, WIDE, atol=1e-12)  # of one registration
         assert (answer.reference_ns, answer.frame_id, answer.pose_frame_id) == (7, "map", "map")
+
+
+def test_a_map_that_comes_again_is_prepared_once_and_a_new_one_anew(asked, monkeypatch) -> None:
+    prepared = []
+    around = pairing.prepare
+    monkeypatch.setattr(pairing, "prepare", lambda *a: prepared.append(1) or around(*a))
+    tracker = tracker_with(pairing="topics")
+    for i, points in enumerate((MAP, MAP.copy(), MAP + [0.1, 0.0, 0.0])):
+        tracker.take_map(0, points, "map")  # whose stamp says nothing
+        tracker.step(i * S, POINTS, Place(IN_MAP))
+    assert len(prepared) == 2
 
 
 def test_odometry_that_drifts_or_jumps_from_the_map_is_followed(asked) -> None:
