@@ -70,7 +70,8 @@ def make(workshop: Workshop, training: Recordings, walks: Recordings) -> Result:
         told = ", ".join(f"{share:.0%} ({_MODELS[name]})" for name, share in inside.items())
         sentences.append(
             f"{SEQUENCES[key].title}: {told}; {walk.n_lost} of {_N_RUNS} runs had a registration "
-            f"in another minimum, which no covariance covers, and are not drawn"
+            f"in another minimum, which no covariance covers, and "
+            f"{'are not drawn' if walk.n_lost < _N_RUNS else 'are drawn nevertheless'}"
         )
     text = (
         f"Runs of ICP odometry from above, {_N_DRAWN} at most, with ellipses of {_N_SIGMA:g}σ of "
@@ -101,8 +102,10 @@ def _walk(workshop: Workshop, found: dict[str, Dataset], walks: Recordings, key:
 
     runs = odometry("relative", _N_RUNS)
     found_way = np.flatnonzero(~runs.lost)
+    if not runs.paths:
+        raise DatasetError(f"{recording.name}: no run of odometry has an answer")
     if not len(found_way):
-        raise DatasetError(f"{recording.name}: each run of odometry was lost; try fewer scans")
+        found_way = np.arange(len(runs.paths))
     first = int(found_way[0])  # the same registrations for either model
     paths["paper"] = odometry("paper", first + 1 + runs.n_failed).paths[first]
     paths["relative"] = runs.paths[first]
