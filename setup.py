@@ -11,6 +11,7 @@ OPEN3D = [
 ]
 CLUSTER = ["distributed>=2024.1"]
 SMALL_GICP = ["small_gicp>=1.0"]
+BENCH = ["kiss-icp>=1.2"]  # what benchmarks/online.py compares with
 TEST = [
     "pytest",
     "scikit-learn>=1.3",
@@ -50,6 +51,7 @@ setup(
         "cluster": CLUSTER,
         "small_gicp": SMALL_GICP,
         "test": TEST,
+        "bench": BENCH,
         "dev": [*TEST, "ruff", "mypy", "import-linter", "types-PyYAML"],
     },
     data_files=[

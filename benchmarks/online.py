@@ -1,6 +1,6 @@
 """Time the node from PointCloud2 in to message out, over DDS and in one process; load it.
 
-    pip install kiss-icp
+    pip install '.[bench]'
     python benchmarks/online.py --recording DIR --json FILE
     python benchmarks/online.py --load 10 --minutes 10 --points 130000 --json FILE
     python benchmarks/online.py --load 50 --minutes 1 --points 130000 --json FILE
@@ -151,7 +151,7 @@ def in_process(scans: InMemory, parameters: dict[str, Any]) -> dict[str, Any]:
         node._worker.answer = alone.timing(node._worker.answer)  # type: ignore[method-assign]
 
         def answer(raw: bytes) -> None:
-            node._on_cloud(deserialize_message(raw, PointCloud2))
+            node._on_cloud(deserialize_message(raw, PointCloud2), {})
             node._work()
 
         for scan in scans:

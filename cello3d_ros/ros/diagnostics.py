@@ -66,10 +66,12 @@ class Statistics:
         self._last_event, self._last_stamp_ns = WAITING if is_listening else INACTIVE, 0
         self._n_failed_in_a_row = 0
 
-    def receive(self) -> None:
-        """Count a cloud that came."""
-        self.counts["received"] += 1
-        self._received_s.append(time.monotonic())
+    def receive(self, n_unheard: int = 0) -> None:
+        """Count a cloud that came, and those before it that came but could not be heard."""
+        self.counts["received"] += 1 + n_unheard
+        if n_unheard:
+            self.dropped["unheard"] += n_unheard
+        self._received_s.extend([time.monotonic()] * (1 + n_unheard))
 
     def fail(self, stamp_ns: int, reason: str, sentence: str) -> None:
         """Count a cloud without an answer."""
@@ -163,6 +165,7 @@ def _described(answer: Answer, C: Array) -> dict[str, str]:
         "iterations": str(found.registration.n_iterations),
         "associations": str(found.registration.n_associations),
         "nearest_rho": f"{found.nearest_rho:.6g}",
+        "novelty": f"{found.novelty:.3f}",
         "effective_neighbors": f"{found.effective_neighbors:.3f}",
         "out_of_distribution": str(found.is_unknown).lower(),
         "long_axis_3_sigma_m": f"{N_SIGMA * sigma_m[0]:.6g}",

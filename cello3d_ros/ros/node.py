@@ -99,6 +99,7 @@ class CovarianceNode(ManagedNode):
         self.active.callback(self._statistics.listen, False)
         self.active.callback(self._worker.stop)
         self._n_postponed, self._is_news = 0, False
+        self._cloud_number: int | None = None
         self._work_is_there = self.create_guard_condition(self._work_when_quiet)
         self.active.callback(self.destroy_guard_condition, self._work_is_there)
         timer = self.create_timer(_TICK_S, self._expire, clock=self._steady)
@@ -113,14 +114,16 @@ class CovarianceNode(ManagedNode):
 
     def _hear(self, topic: Topic) -> str:
         """Subscribe for as long as the node is active; return the full name of the topic."""
-        callback: Callable[[Any], None] = {
+        callbacks: dict[Role, Callable[..., None]] = {
             Role.CLOUD: self._on_cloud,
             Role.POSE: self._on_pose,
             Role.REFERENCE: self._on_reference,
             Role.TRANSFORMS: self._on_transforms,
             Role.STATIC_TRANSFORMS: self._on_static_transforms,
-        }[topic.role]
-        subscription = self.create_subscription(topic.kind, topic.name, callback, topic.qos)
+        }
+        subscription = self.create_subscription(
+            topic.kind, topic.name, callbacks[topic.role], topic.qos
+        )
         self.active.callback(self.destroy_subscription, subscription)
         return str(subscription.topic_name)
 
@@ -161,12 +164,22 @@ class CovarianceNode(ManagedNode):
     def _on_reference(self, message: PointCloud2) -> None:
         self._worker.hear_reference(message)
 
-    def _on_cloud(self, message: PointCloud2) -> None:
+    def _on_cloud(self, message: PointCloud2, info: dict[str, Any]) -> None:
         self._is_news = True
-        self._statistics.receive()
+        self._statistics.receive(self._n_unheard(info))
         self._worker.hear_cloud(message, self._now_ns())
         if self._worker.has_work:
             self._work_is_there.trigger()
+
+    def _n_unheard(self, info: dict[str, Any]) -> int:
+        """Return how many clouds of this publisher came since the last and never got here.
+
+        Several publishers count each for itself, and nobody says whose a cloud is: then 0.
+        """
+        before, self._cloud_number = self._cloud_number, info.get("publication_sequence_number")
+        if before is None or self._cloud_number is None or self.count_publishers("points") != 1:
+            return 0
+        return max(0, int(self._cloud_number) - before - 1)
 
     def _expire(self) -> None:
         self._worker.expire(_TICK_S)

@@ -26,6 +26,9 @@ from cello3d_ros.ros.intake import JUMP_NS, Intake, Job, Skip, stamp_order
 from cello3d_ros.ros.odometry import OdometryBuffer, OdometryError, PoseSource
 from cello3d_ros.ros.tracker import Answer, Tracker
 
+MAX_CLOUD_BYTES = 64 * 1024**2  # of a message on points: work takes up to 30 times its size
+MAX_MAP_BYTES = 1024**3  # of one on reference_points, which is cropped before it is worked on
+
 
 class Worker:
     """Hears poses and clouds, chooses the cloud to work on and registers it.
@@ -105,7 +108,7 @@ class Worker:
         """Register to this cloud from now on."""
         stamp_ns, frame_id = messages.stamp_ns_of(message), message.header.frame_id
         try:
-            points = read_points(message)
+            points = _points(message, MAX_MAP_BYTES)
             if not frame_id or not len(points):
                 raise CloudError("it has no frame_id" if not frame_id else "it has no points")
         except Exception as error:  # whatever bytes may do, the node outlives them
@@ -177,7 +180,7 @@ class Worker:
         """Return the points of a cloud in its turn; a damaged one does not move the clock."""
         try:
             self._check_not_in_future(stamp_ns, now_ns)
-            points = read_points(message)
+            points = _points(message, MAX_CLOUD_BYTES)
         except OdometryError as error:
             return Skip(stamp_ns, "future_stamp", str(error))
         except CloudError as error:
@@ -198,3 +201,10 @@ class Worker:
         ahead_s = 1e-9 * (stamp_ns - now_ns)
         if now_ns > 0 and ahead_s > self.config.node.future_tolerance_s:
             raise OdometryError(f"the stamp is {ahead_s:.3f} s in the future")
+
+
+def _points(message: PointCloud2, max_bytes: int) -> Array:
+    """Return the points of a cloud of bounded size.  Raises CloudError."""
+    if len(message.data) > max_bytes:
+        raise CloudError(f"PointCloud2 holds {len(message.data)} bytes, more than {max_bytes}")
+    return read_points(message)

@@ -78,6 +78,8 @@ def reasons() -> set[str]:
                 name = ast.unparse(node.func)
                 words = [node.args[1]] if name == "Skip" else words
                 words = [node.args[0]] if name == "self._forget" else words
+            elif isinstance(node, ast.Subscript) and ast.unparse(node.value) == "self.dropped":
+                words = [node.slice]
             elif isinstance(node, ast.FunctionDef) and node.name in ("reason_of", "stamp_order"):
                 words = list(ast.walk(node))
             found |= {word.value for word in words if isinstance(word, ast.Constant)}

@@ -15,6 +15,7 @@ pytest.importorskip("rclpy")
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
+from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.ros.process import NodeProcess
 from cello3d_ros.ros.replay import Player
 
@@ -66,14 +67,19 @@ def test_parameters_that_change_under_load(robot, change, ask) -> None:
 
 def test_the_newest_cloud_is_next_when_many_came_during_long_work(robot) -> None:
     """Each with its odometry, which waits in a queue of its own."""
-    player = robot.player
+    player, before = robot.player, robot.walk()
     stamps = []
     for n_points in (800_000, *[4000] * 9):
         robot.step()
         stamps.append(robot.stamp_ns)
         player.publish_odometry(robot.stamp_ns, robot.pose())
         player.publish_cloud(robot.stamp_ns, robot.points(n_points))
-    assert robot.settled()["last_event"] == "answered"
+    after = robot.settled()
+    assert after["last_event"] == "answered"
+    counts = [int(after[key]) - int(before[key]) for key in ("received", "answered", "dropped")]
+    assert counts[0] == 10  # every cloud is accounted for
+    assert counts[0] == counts[1] + counts[2]
+    assert int(after["dropped.unheard"]) > int(before.get("dropped.unheard", 0))
     assert [ns for ns in stamps[1:] if ns in player.replay.relative] == stamps[-1:]
     robot.assert_right_again()
 
@@ -84,7 +90,7 @@ from cello3d_ros.ros.replay import Player
 from conftest import Robot
 robot = Robot(Player(int(sys.argv[1])))
 robot.stamp_ns = int(sys.argv[2])
-robot.player.connect(robot.stamp_ns, robot.pose(), 60.0)
+robot.player.connect(robot.stamp_ns, robot.pose(), 180.0)
 while True:
     robot.walk()
     print(robot.n, flush=True)
@@ -165,7 +171,7 @@ def _named(name: str, log, domain_id: int, model_path) -> NodeProcess:
 
 def _connect(robot: Robot, process: NodeProcess) -> None:
     robot.player._check = process.check
-    robot.player.connect(robot.stamp_ns, robot.pose(), 60.0)
+    robot.player.connect(robot.stamp_ns, robot.pose(), 180.0)
 
 
 def corridor(rng: np.random.Generator, x: float) -> np.ndarray:
@@ -179,11 +185,12 @@ def corridor(rng: np.random.Generator, x: float) -> np.ndarray:
 
 def test_a_scene_that_degenerates_and_recovers(tmp_path, domain_id) -> None:
     """In a corridor without ends the uncertainty along it is large and said to be so."""
-    player = Player(domain_id, "/shipped_node")
+    model = tmp_path / "sandwich.npz"
+    save_model(constant_model(np.eye(6), 704, shape="sandwich"), model)
+    player = Player(domain_id, "/aware_node")
     robot, rng = Robot(player), np.random.default_rng(5)
-    log, arguments = tmp_path / "log", ["-r", "__node:=shipped_node"]
     try:
-        with NodeProcess(log, domain_id, {}, arguments) as process:
+        with _named("aware_node", tmp_path / "log", domain_id, model) as process:
             _connect(robot, process)
             at_home = _weakest(robot, robot.points)
             inside = _weakest(robot, lambda: corridor(rng, 0.0))
@@ -198,10 +205,12 @@ def test_a_scene_that_degenerates_and_recovers(tmp_path, domain_id) -> None:
 
 
 def _weakest(robot: Robot, points: Callable[[], np.ndarray]) -> tuple[float, list[float]]:
-    """Walk on into the new scene; return the largest sigma and its direction."""
-    for _ in range(5):  # the old reference is given up after three failures
+    """Walk on into the new scene; return the largest sigma and its direction when answered."""
+    for n in range(20):
         robot.step()
         status = robot.send(points())
+        if n > 3 and status["last_event"] == "answered":  # the old reference is given up by then
+            break
     assert status["last_event"] == "answered"
     direction = [float(word) for word in status["weakest_direction"].split()]
     return float(status["weakest_sigma_m"]), direction

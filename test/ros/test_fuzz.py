@@ -101,7 +101,7 @@ def test_thousands_of_damaged_clouds(walker, node, ask) -> None:
         for _ in range(N_GOOD):  # a scrambled cloud may have become the reference
             walker.good()
         walker.assert_right()
-    assert _count(walker, "received") - n_before > 0.5 * N_DAMAGED  # ROS itself refuses the rest
+    assert _count(walker, "received") - n_before > 0.9 * N_DAMAGED  # heard or unheard
     assert memory_mb(node.pid) - memory_before_mb < 30.0
 
 

@@ -10,7 +10,12 @@ import pytest
 
 pytest.importorskip("rclpy")
 
+from cello3d_ros.config import Config
+from cello3d_ros.covariance.model import constant_model
+from cello3d_ros.ros import messages
+from cello3d_ros.ros.intake import Skip
 from cello3d_ros.ros.process import NodeDiedError, NodeProcess
+from cello3d_ros.ros.worker import MAX_CLOUD_BYTES, Worker
 
 START_MB = 400.0  # resident memory of a node that has imported everything, with room to spare
 
@@ -59,6 +64,20 @@ def test_no_port_but_those_of_dds_and_no_file_but_logs(lone_robot, node, home) -
     assert len(sockets(node.pid, "udp")) <= len(sockets(os.getpid(), "udp"))
     written = {path.relative_to(home).parts[0] for path in home.rglob("*") if path.is_file()}
     assert written <= {".ros"}
+
+
+def test_a_cloud_beyond_the_bound_is_refused_before_it_is_read(constant_Y) -> None:
+    skips: list[Skip] = []
+    worker = Worker(constant_model(constant_Y, 704), Config(), skips.append, print)
+    message = messages.cloud_to(1, "lidar", np.ones((MAX_CLOUD_BYTES // 12 + 1, 3)))
+    worker.hear_cloud(message, 0)
+    assert [skip.reason for skip in skips] == ["malformed"]
+    assert f"more than {MAX_CLOUD_BYTES}" in skips[0].sentence
+    message.data = message.data[:1200]
+    message.width, message.row_step = 100, 1200
+    worker.hear_cloud(message, 0)
+    assert len(skips) == 1
+    assert worker.has_work
 
 
 def absurd(path: Path) -> None:
