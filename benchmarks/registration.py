@@ -117,7 +117,7 @@ def profile(read: Any, ref: Any, normals: Any, T: Any, n_runs: int = 50) -> dict
     order = tree_order(ref)
     ref, normals = np.ascontiguousarray(ref[order]), np.ascontiguousarray(normals[order])
     moved = np.ascontiguousarray(transform(T, read[tree_order(read)]))
-    leaves = build_leaves(ref)
+    leaves = build_leaves(ref, np.arange(len(ref)))
     k = _CONFIG.n_neighbors
     d2, indices = np.empty((len(read), k)), np.full((len(read), k), -1)
     search(moved, leaves, np.inf, d2, indices)
