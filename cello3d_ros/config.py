@@ -235,7 +235,7 @@ class NodeConfig(Section):
         1.0,
     )
     inflate_unknown: bool = _setting(
-        True, "widen the covariance of an unknown pair to the mean of the model's examples"
+        True, "widen the model's prediction for an unknown pair to the mean of its examples"
     )
     warn_sigma_m: float = _setting(0.3, "3 sigma along the weakest axis that warns", 0.0)
     error_sigma_m: float = _setting(1.0, "3 sigma along the weakest axis that is an error", 0.0)

@@ -9,10 +9,16 @@ import numpy as np
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import Pipeline
 from cello3d_ros.covariance.description import describe
-from cello3d_ros.covariance.methods import DEFAULTS, METHODS, MethodSettings, Pair, predicted
+from cello3d_ros.covariance.methods import (
+    DEFAULTS,
+    METHODS,
+    MethodSettings,
+    Pair,
+    predicted,
+    widened,
+)
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import ModelError, RegistrationError
-from cello3d_ros.geometry.gaussian import larger
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.backends import register
 from cello3d_ros.registration.icp import Registration
@@ -69,12 +75,10 @@ def estimate(
     description = describe(reading, reference, T_ref_read, pipeline, n_threads=n_threads)
     pair = Pair(reading, reference, registration, description)
     prediction = predicted(pair, model)
-    Y = prediction.covariance
-    if method != "model":
+    if method == "model":
+        Y = widened(prediction, pair, pipeline, model, rng, settings)
+    else:
         Y = METHODS[method](pair, pipeline, model, rng, settings)
-    is_unknown = prediction.nearest_rho > settings.rho_limit
-    if is_unknown and settings.widen_unknown:
-        Y = larger(METHODS["constant"](pair, pipeline, model, rng, settings), Y)
     return Estimate(
         registration,
         description.overlap_ratio,
@@ -83,7 +87,7 @@ def estimate(
         prediction.effective_neighbors,
         method,
         prediction.novelty,
-        is_unknown,
+        prediction.nearest_rho > settings.rho_limit,
     )
 
 

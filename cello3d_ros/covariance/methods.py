@@ -22,7 +22,7 @@ from cello3d_ros.covariance.fused import fused, monte_carlo, registrations
 from cello3d_ros.covariance.model import Model, Prediction, predict
 from cello3d_ros.covariance.sigma_points import sigma_points
 from cello3d_ros.errors import ModelError, RegistrationError
-from cello3d_ros.geometry.gaussian import is_positive_definite, matrix_sqrt, symmetrized
+from cello3d_ros.geometry.gaussian import is_positive_definite, larger, matrix_sqrt, symmetrized
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.icp import Registration
 
@@ -40,9 +40,9 @@ class MethodSettings(NamedTuple):
     """What methods assume and what is made of their answers.
 
     sigma_m: deviation of the sensor's noise along each axis; n_registrations: extra runs of ICP
-    by ``monte_carlo`` and ``fused``.  What ``estimate`` makes of any answer: rho_limit, the
-    ``nearest_rho`` beyond which the pair is unlike all examples; widen_unknown, whether it is
-    then widened to their mean; scale, a factor for every covariance.
+    by ``monte_carlo`` and ``fused``; rho_limit: the ``nearest_rho`` beyond which a pair is unlike
+    all examples; widen_unknown: whether the model's prediction is then widened to their mean;
+    scale: what ``estimate`` multiplies every covariance by.
     """
 
     sigma_m: float = 0.01
@@ -68,8 +68,8 @@ def by_model(
     rng: np.random.Generator,
     settings: MethodSettings,
 ) -> Array:
-    """Return the model's prediction."""
-    return predicted(pair, model).covariance
+    """Return the model's prediction, wider where the settings say so."""
+    return widened(predicted(pair, model), pair, pipeline, model, rng, settings)
 
 
 def by_constant(
@@ -167,8 +167,9 @@ def by_fusion(
     rng: np.random.Generator,
     settings: MethodSettings,
 ) -> Array:
-    """Return the model's prediction, updated by a few registrations."""
-    return fused(predicted(pair, model).covariance, _online(pair, pipeline, model, rng, settings))
+    """Return the answer of ``by_model``, updated by a few registrations."""
+    F = by_model(pair, pipeline, model, rng, settings)
+    return fused(F, _online(pair, pipeline, model, rng, settings))
 
 
 DEFAULTS = MethodSettings()
@@ -202,6 +203,24 @@ def predicted(pair: Pair, model: Model) -> Prediction:
     found = pair.description
     inputs = model_inputs(model.features, found.descriptors, found.features)
     return predict(model, inputs[0], found.shapes.get(model.shape))
+
+
+def widened(
+    prediction: Prediction,
+    pair: Pair,
+    pipeline: Pipeline,
+    model: Model,
+    rng: np.random.Generator,
+    settings: MethodSettings,
+) -> Array:
+    """Return a prediction's covariance; of a pair unlike all examples, if asked for, the larger.
+
+    That is the larger of it and the mean of the examples (``by_constant``).
+    """
+    if not settings.widen_unknown or prediction.nearest_rho <= settings.rho_limit:
+        return prediction.covariance
+    prior = by_constant(pair, pipeline, model, rng, settings)
+    return larger(prior, prediction.covariance)
 
 
 def _online(

@@ -165,6 +165,7 @@ def _described(answer: Answer, C: Array) -> dict[str, str]:
         "iterations": str(found.registration.n_iterations),
         "associations": str(found.registration.n_associations),
         "nearest_rho": f"{found.nearest_rho:.6g}",
+        "novelty": f"{found.novelty:.3f}",
         "effective_neighbors": f"{found.effective_neighbors:.3f}",
         "out_of_distribution": str(found.is_unknown).lower(),
         "long_axis_3_sigma_m": f"{N_SIGMA * sigma_m[0]:.6g}",

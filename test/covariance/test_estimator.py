@@ -5,6 +5,7 @@ from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import GridConfig, IcpConfig, OverlapConfig, Pipeline
 from cello3d_ros.covariance.description import describe, turns
 from cello3d_ros.covariance.estimator import estimate, registered_elsewhere
+from cello3d_ros.covariance.fused import PRIOR_WEIGHT
 from cello3d_ros.covariance.methods import METHODS, MethodSettings
 from cello3d_ros.covariance.model import Model, constant_model
 from cello3d_ros.errors import ModelError, NoOverlapError, RegistrationError
@@ -176,14 +177,16 @@ def two_examples(pair, far: float):
     )
 
 
-@pytest.mark.parametrize("method", ["model", "hessian"])
-def test_an_answer_far_from_every_example_is_widened_to_their_mean(pair, method):
+@pytest.mark.parametrize("method", ["model", "fused"])
+def test_a_prediction_far_from_every_example_is_widened_to_their_mean(pair, method):
     model, settings = two_examples(pair, 3.0), MethodSettings(rho_limit=4.0, widen_unknown=True)
     assert settings.rho_limit < 9.0
     rng = [np.random.default_rng(5) for _ in range(3)]
     plain = estimate(*pair, T_TRUE, model, PIPELINE, rng[0], method)
     found = estimate(*pair, T_TRUE, model, PIPELINE, rng[1], method, settings)
     mean = model.covariances.mean(axis=0)
+    if method == "fused":  # twelve registrations weigh in
+        mean = mean * PRIOR_WEIGHT / (PRIOR_WEIGHT + settings.n_registrations)
     assert found.nearest_rho == plain.nearest_rho > settings.rho_limit
     assert (plain.is_unknown, found.is_unknown) == (False, True)
     for smaller in (plain.covariance, mean):
@@ -193,6 +196,15 @@ def test_an_answer_far_from_every_example_is_widened_to_their_mean(pair, method)
     kept = estimate(*pair, T_TRUE, near, PIPELINE, rng[2], method, settings)
     assert np.linalg.eigvalsh(kept.covariance)[-1] < 1e-3
     assert not kept.is_unknown
+
+
+def test_what_does_not_come_from_the_model_is_not_widened(pair):
+    model, rng = two_examples(pair, 3.0), [np.random.default_rng(5) for _ in range(2)]
+    settings = MethodSettings(rho_limit=4.0, widen_unknown=True)
+    plain = estimate(*pair, T_TRUE, model, PIPELINE, rng[0], "hessian")
+    found = estimate(*pair, T_TRUE, model, PIPELINE, rng[1], "hessian", settings)
+    np.testing.assert_array_equal(found.covariance, plain.covariance)
+    assert found.is_unknown
 
 
 def test_an_answer_far_from_every_example_is_only_told_of_unless_it_is_to_be_widened(pair):
