@@ -325,7 +325,11 @@ def test_the_order_of_the_examples_does_not_change_predictions() -> None:
 
 SGD = TrainingConfig(
     features="descriptor",
-    shape="none", theta="diagonal", mean_weight=0.0, regularization=1e-3, optimizer="sgd"
+    shape="none",
+    theta="diagonal",
+    mean_weight=0.0,
+    regularization=1e-3,
+    optimizer="sgd",
 )
 
 
@@ -445,7 +449,7 @@ def test_a_singular_shape_is_one_sentence() -> None:
     examples = some()
     examples.shapes["sandwich"][5] = np.diag([1.0, 1, 1, 1, 1, 0])
     with pytest.raises(DatasetError, match="the sandwich of a pair is singular to rounding"):
-        train(examples, TrainingConfig(shape="sandwich"))
+        train(examples, TrainingConfig(features="descriptor", shape="sandwich"))
 
 
 def test_a_missing_shape_is_named() -> None:
