@@ -16,6 +16,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
 from cello3d_ros.covariance.model import constant_model, save_model
+from cello3d_ros.ros import messages
 from cello3d_ros.ros.process import NodeProcess
 from cello3d_ros.ros.replay import Player
 
@@ -68,12 +69,15 @@ def test_parameters_that_change_under_load(robot, change, ask) -> None:
 def test_the_newest_cloud_is_next_when_many_came_during_long_work(robot) -> None:
     """Each with its odometry, which waits in a queue of its own."""
     player, before = robot.player, robot.walk()
-    stamps = []
+    clouds, poses = [], []
     for n_points in (800_000, *[4000] * 9):
         robot.step()
-        stamps.append(robot.stamp_ns)
-        player.publish_odometry(robot.stamp_ns, robot.pose())
-        player.publish_cloud(robot.stamp_ns, robot.points(n_points))
+        clouds.append(messages.cloud_to(robot.stamp_ns, "lidar", robot.points(n_points)))
+        poses.append(messages.odometry_to(robot.stamp_ns, "odom", "lidar", robot.pose()))
+    for cloud, pose in zip(clouds, poses):
+        player.odometry.publish(pose)
+        player.clouds.publish(cloud)
+    stamps = [messages.stamp_ns_of(cloud) for cloud in clouds]
     after = robot.settled()
     assert after["last_event"] == "answered"
     counts = [int(after[key]) - int(before[key]) for key in ("received", "answered", "dropped")]
