@@ -33,7 +33,11 @@ def main() -> None:
     report: dict[str, object] = {"cores": os.cpu_count()}
     for theta in arguments.theta:
         config = TrainingConfig(
-            shape="none", theta=theta, regularization=0.0, max_iterations=arguments.iterations
+            shape="none",
+            features="descriptor",
+            theta=theta,
+            regularization=0.0,
+            max_iterations=arguments.iterations,
         )
         begin, used = time.perf_counter(), time.process_time()
         training = train(examples, config)

@@ -75,6 +75,8 @@ def select_inputs(examples: Examples, kind: str) -> Examples:
     """Return the examples with what a model of ``kind`` looks at as their features."""
     if kind == "descriptor":
         return examples
+    if len(examples.global_features) != len(examples.features):
+        raise DatasetError("the examples hold no global features: train with features descriptor")
     first = unturned_rows(examples).start
     descriptors = examples.features[:, first:].astype(np.float64)
     inputs = model_inputs(kind, descriptors, examples.global_features)

@@ -227,7 +227,8 @@ def test_what_cannot_be_trained_on_is_one_sentence_and_leaves_nothing(
 def test_ctrl_c_in_training_writes_the_best_so_far(tmp_path: Path) -> None:
     out, dataset = tmp_path / "model.npz", fill(tmp_path / "set", ["a", "b", "c"])
     (tmp_path / "c.yaml").write_text(
-        "training: {optimizer: sgd, learning_rate: 1.0e-6, max_iterations: 1000000}"
+        "training: {features: descriptor, optimizer: sgd, learning_rate: 1.0e-6, "
+        "max_iterations: 1000000}"
     )
     command = [sys.executable, "-m", "cello3d_ros.cli.main", "train", dataset, "--out", out]
     controller, terminal = os.openpty()

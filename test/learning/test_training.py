@@ -449,7 +449,7 @@ def test_a_singular_shape_is_one_sentence() -> None:
     examples = some()
     examples.shapes["sandwich"][5] = np.diag([1.0, 1, 1, 1, 1, 0])
     with pytest.raises(DatasetError, match="the sandwich of a pair is singular to rounding"):
-        train(examples, TrainingConfig(shape="sandwich"))
+        train(examples, TrainingConfig(features="descriptor", shape="sandwich"))
 
 
 def test_a_missing_shape_is_named() -> None:
@@ -528,3 +528,49 @@ def test_a_damaged_pair_stops_training_with_its_name(tmp_path: Path) -> None:
 def test_no_accepted_pair_is_said(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no accepted pair"):
         load_examples([filled(tmp_path / "one", ("a",))], ["nobody"])
+
+
+def test_global_features_are_learned_from_without_turned_copies() -> None:
+    """Planted: Y depends on one global feature; the descriptor is noise."""
+    examples = planted(120)
+    noise = np.random.default_rng(3).normal(size=(120, 2, 4))
+    with_both = dataclasses.replace(
+        examples,
+        features=noise.astype(np.float32),
+        global_features=examples.features[:, 0].astype(np.float64),
+        rotations_rad=np.array([0.0, 1.0]),
+    )
+    config = dataclasses.replace(PAPER, features="global", max_iterations=20)
+    model = train(with_both, config).model
+    plain = train(examples, dataclasses.replace(config, features="descriptor")).model
+    assert model.features == "global"
+    assert model.n_examples == 120
+    np.testing.assert_allclose(model.theta, plain.theta, rtol=1e-4, atol=1e-6)
+    both = train(with_both, dataclasses.replace(config, features="both")).model
+    assert both.n_features == plain.n_features + 4
+    with pytest.raises(DatasetError, match="no global features"):
+        train(examples, config)
+
+
+def test_the_evidence_is_that_of_leaving_recordings_out() -> None:
+    model = train(planted(120), dataclasses.replace(PAPER, max_iterations=5)).model
+    groups = planted(120).groups
+    P = model.projections
+    rho = ((P[:, None] - P) ** 2).sum(axis=2)
+    rho[groups[:, None] == groups] = np.inf
+    expected = np.quantile(rho.min(axis=1), np.linspace(0, 1, 101))
+    np.testing.assert_allclose(model.rho_quantiles, expected, rtol=1e-6, atol=1e-9)
+    w = np.exp(rho.min(axis=1, keepdims=True) - rho)
+    w /= w.sum(axis=1, keepdims=True)
+    expected = np.quantile(1 / (w**2).sum(axis=1), np.linspace(0, 1, 101))
+    np.testing.assert_allclose(model.neighbors_quantiles, expected, rtol=1e-6)
+
+
+def test_the_margin_is_in_the_figures_too() -> None:
+    one, wide = (
+        train(planted(60), dataclasses.replace(PAPER, margin=margin, max_iterations=3))
+        for margin in (1.0, 2.0)
+    )
+    a, b = (t.figures["leave_recording_out"]["model"] for t in (one, wide))
+    assert b["mahalanobis2_over_6"] == pytest.approx(a["mahalanobis2_over_6"] / 2.0)
+    assert wide.model.margin == 2.0
