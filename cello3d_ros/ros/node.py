@@ -177,9 +177,12 @@ class CovarianceNode(ManagedNode):
         Several publishers count each for itself, and nobody says whose a cloud is: then 0.
         """
         before, self._cloud_number = self._cloud_number, info.get("publication_sequence_number")
-        if before is None or self._cloud_number is None or self.count_publishers("points") != 1:
+        if before is None or self._cloud_number is None or self._n_cloud_publishers() != 1:
             return 0
         return max(0, int(self._cloud_number) - before - 1)
+
+    def _n_cloud_publishers(self) -> int:
+        return int(self.count_publishers(self.resolve_topic_name("points")))
 
     def _expire(self) -> None:
         self._worker.expire(_TICK_S)

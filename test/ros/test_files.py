@@ -171,3 +171,10 @@ def test_the_dds_profile_has_shared_memory_for_a_million_points() -> None:
     ]
     assert sizes
     assert sizes[0] > 16_000_000
+
+
+def test_the_tests_that_the_page_of_faults_names_are_there() -> None:
+    page = (ROOT / "docs" / "reliability.md").read_text()
+    names = set(re.findall(r"`(?:[\w/]*/)?(test_\w+)(?:\.py)?`", page))
+    assert len(names) > 10
+    assert names <= {path.stem for path in (ROOT / "test").rglob("test_*.py")}
