@@ -161,7 +161,7 @@ class TrainingConfig(Section):
 class NodeConfig(Section):
     """What only the node needs."""
 
-    model: str = _setting("", "model file; empty is the shipped one")
+    model: str = _setting("", "model file or name of a shipped one; empty is general")
     autostart: bool = _setting(True, "configure and activate at once; false waits to be told")
     T_base_sensor: tuple[float, ...] = _setting(
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),

@@ -36,7 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("build/demo"), help="folder of the results (build/demo)"
     )
-    parser.add_argument("--model", type=Path, help="model file (the shipped one)")
+    parser.add_argument(
+        "--model", default="", help="model file or name of a shipped one (general)"
+    )
     parser.add_argument(
         "--rate", type=float, metavar="HZ", help="clouds a second (each waits for the answer)"
     )
@@ -223,6 +225,7 @@ def _replay(
     recording: Recording, arguments: argparse.Namespace
 ) -> tuple[Replay, str | None, float | None]:
     """Play into a node of our own.  Returns what was heard, a complaint, the node's memory."""
+    from cello3d_ros.covariance.model import find_model
     from cello3d_ros.ros.process import NodeProcess, environment
 
     domain_id = arguments.domain_id
@@ -234,8 +237,8 @@ def _replay(
     except ImportError as error:
         raise Cello3dError(f"{_ROS_IS_MISSING} ({error})") from None
     given = [word for text in arguments.param for word in ("-p", text)]
-    if arguments.model is not None:
-        given += ["-p", f"node.model:={arguments.model.resolve()}"]
+    if arguments.model:
+        given += ["-p", f"node.model:={find_model(arguments.model).resolve()}"]
     with NodeProcess(arguments.out / "node.log", domain_id, ros_arguments=given) as node:
         player = Player(domain_id, check=node.check)
         try:

@@ -26,7 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
     parser.add_argument("recording", metavar="RECORDING", type=Path, help="bag or data set")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to make")
-    parser.add_argument("--model", metavar="M", type=Path, help="model file (the shipped one)")
+    parser.add_argument(
+        "--model", metavar="M", default="", help="model file or name of a shipped one (general)"
+    )
     parser.add_argument(
         "--config", metavar="FILE", type=Path, help="YAML settings, of which 'node' counts"
     )
@@ -40,12 +42,12 @@ def run(arguments: argparse.Namespace) -> None:
     Raises Cello3dError; RecordingError when no pair was answered.
     """
     from cello3d_ros.config import PIPELINE, Config, load_config
-    from cello3d_ros.covariance.model import load_model, shipped_model_path
+    from cello3d_ros.covariance.model import find_model, load_model
     from cello3d_ros.ros.offline import replay
     from cello3d_ros.ros.tracker import Tracker
 
     recording = open_source(arguments.recording, arguments)
-    model = load_model(arguments.model or shipped_model_path())
+    model = load_model(find_model(arguments.model))
     node = load_config(arguments.config).node if arguments.config else Config().node
     config = Config(**{name: getattr(model.pipeline, name) for name in PIPELINE}, node=node)
     tracker = Tracker(model, config, node)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -31,7 +30,7 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
 from cello3d_ros.config import PIPELINE, Config, differences
-from cello3d_ros.covariance.model import Model, load_model, shipped_model_path
+from cello3d_ros.covariance.model import Model, find_model, load_model
 from cello3d_ros.errors import Cello3dError, ConfigError
 from cello3d_ros.ros import parameters
 from cello3d_ros.ros.diagnostics import Statistics
@@ -70,7 +69,7 @@ class CovarianceNode(ManagedNode):
 
     def configure(self) -> None:
         """Load, check and warm up everything, then say what may be heard."""
-        path = Path(str(self.get_parameter(parameters.MODEL).value) or shipped_model_path())
+        path = find_model(str(self.get_parameter(parameters.MODEL).value))
         self._model = load_model(path)
         config = self._declared(self._model)
         topics(config.node)  # what is not installed is better missed before the warming up

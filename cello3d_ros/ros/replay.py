@@ -32,6 +32,7 @@ _TYPES: dict[str, Any] = {
     "markers": MarkerArray,
     "diagnostics": DiagnosticArray,
 }
+_START_S = 180.0  # left to a node to start: the first time it compiles its kernels
 _N_ODOMETRY = 4  # odometry messages for each cloud
 
 
@@ -216,7 +217,7 @@ def play(
     for n, scan in enumerate(with_odometry(recording)):
         assert scan.T_odom_sensor is not None
         if before is None:
-            player.connect(scan.stamp_ns, scan.T_odom_sensor, 60.0)
+            player.connect(scan.stamp_ns, scan.T_odom_sensor, _START_S)
             next_s = time.monotonic()
         replay.T_world[scan.stamp_ns] = scan.T_world_sensor
         replay.T_odom[scan.stamp_ns] = scan.T_odom_sensor

@@ -118,6 +118,16 @@ def test_the_node_takes_the_shipped_parameter_file(tmp_path, domain_id, model_pa
         assert "[WARN]" not in process.output()
 
 
+def test_a_shipped_model_has_a_name(tmp_path, domain_id) -> None:
+    with NodeProcess(tmp_path / "log", domain_id, {"node.model": "unstructured"}) as process:
+        player = Player(domain_id, check=process.check)
+        running = player.spin_until(lambda: bool(player.replay.last_status), 60.0)
+        player.close()
+        assert running
+        assert player.replay.last_status["model"] == "unstructured.npz"
+        assert process.stop() == 0
+
+
 def test_the_sensor_may_sit_anywhere_on_the_base(tmp_path, domain_id, model_path) -> None:
     quarter = [0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4)]
     T_base_sensor = se3.pose([0.4, -0.2, 1.0], quarter)
