@@ -11,6 +11,7 @@ OPEN3D = [
 ]
 CLUSTER = ["distributed>=2024.1"]
 SMALL_GICP = ["small_gicp>=1.0"]
+REPORT = ["plotly>=6"]  # maintained; its 3-D views work in one file without a network
 BENCH = ["kiss-icp>=1.2"]  # what benchmarks/online.py compares with
 TEST = [
     "pytest",
@@ -19,6 +20,7 @@ TEST = [
     "mcap-ros2-support>=0.5",
     *CLUSTER,
     *SMALL_GICP,
+    *REPORT,
 ]
 
 setup(
@@ -31,7 +33,7 @@ setup(
     license="BSD-3-Clause",
     python_requires=">=3.11",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["models/*.npz", "py.typed"]},
+    package_data={NAME: ["models/*.npz", "py.typed", "reporting/assets/*"]},
     zip_safe=False,
     install_requires=[
         "setuptools",
@@ -50,9 +52,10 @@ setup(
         "open3d": OPEN3D,
         "cluster": CLUSTER,
         "small_gicp": SMALL_GICP,
+        "report": REPORT,
         "test": TEST,
         "bench": BENCH,
-        "dev": [*TEST, "ruff", "mypy", "import-linter", "types-PyYAML"],
+        "dev": [*TEST, "ruff", "mypy", "import-linter", "types-PyYAML", "playwright"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

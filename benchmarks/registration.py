@@ -24,6 +24,7 @@ from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import exp, transform
 from cello3d_ros.registration import icp as kernels
+from cello3d_ros.registration.candidates import Places, make_candidates, nearest
 from cello3d_ros.registration.icp import icp, register_many
 from cello3d_ros.registration.search import build_leaves, search, tree_order
 
@@ -117,14 +118,18 @@ def profile(read: Any, ref: Any, normals: Any, T: Any, n_runs: int = 50) -> dict
     order = tree_order(ref)
     ref, normals = np.ascontiguousarray(ref[order]), np.ascontiguousarray(normals[order])
     moved = np.ascontiguousarray(transform(T, read[tree_order(read)]))
-    leaves = build_leaves(ref)
+    leaves = build_leaves(ref, np.arange(len(ref)))
     k = _CONFIG.n_neighbors
     d2, indices = np.empty((len(read), k)), np.full((len(read), k), -1)
     search(moved, leaves, np.inf, d2, indices)
     rank = int(d2.size * _CONFIG.trim_ratio)
     limit = kernels._of_rank(d2.ravel(), rank, np.inf)
+    centered = ref - ref.mean(axis=0)
+    places = Places(make_candidates(centered, k), np.zeros(len(read), np.int32))
+    from_mean, scratch = moved - ref.mean(axis=0), (np.empty_like(d2), np.empty_like(indices))
     parts = {
         "search": lambda: search(moved, leaves, 1.2 * limit, d2, indices),
+        "search, shared reference": lambda: nearest(from_mean, places, 1.2 * limit, *scratch),
         "trim": lambda: kernels._of_rank(d2.ravel(), rank, 1.2 * limit),
         "accumulate": lambda: kernels._plane_step(moved, ref, normals, d2, indices, limit),
     }

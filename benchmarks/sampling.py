@@ -71,6 +71,13 @@ def seconds_of(reading: Cloud, reference: Cloud, starts: Any, n_threads: int) ->
     return time.perf_counter() - start
 
 
+def cpu_seconds_of(pairs: list[tuple[Cloud, Cloud]], starts: Any) -> float:
+    begin = time.process_time()
+    for reading, reference in pairs:
+        seconds_of(reading, reference, starts, 1)
+    return time.process_time() - begin
+
+
 def measure(reading: Cloud, reference: Cloud, starts: Any, arguments: Any) -> dict[str, Any]:
     command = [sys.executable, __file__, "--start"]
     if arguments.case:
@@ -89,7 +96,15 @@ def measure(reading: Cloud, reference: Cloud, starts: Any, arguments: Any) -> di
             cpu_s += (time.process_time() - begin) * (n_threads == 1)
     one, two = (statistics.median(t) for t in times.values())
     n = arguments.registrations
+    sizes = (max(n // 4, 1), max(n // 2, 1), n)
     return {
+        "cpu_seconds_by_samples": {
+            size: cpu_seconds_of([(reading, reference)], starts[:size]) for size in sizes
+        },
+        "cpu_seconds_by_pairs": {
+            size: cpu_seconds_of([(reading, reference)] * size, starts[: sizes[0]])
+            for size in (1, 2, 4)
+        },
         "registrations_per_second_1_thread": n / one,
         "registrations_per_second_2_threads": n / two,
         "registrations_per_cpu_second": n * arguments.runs / cpu_s,

@@ -132,8 +132,9 @@ def run(arguments: argparse.Namespace) -> None:
     predictions = from_dataset(model, examples, mean, settings)
     _add_online(predictions, keys, recordings, model, settings, arguments)
     assumed = {name: getattr(settings, name) for name in ("sigma_m", "n_registrations")}
-    report = {"model": str(path), "shape": model.shape, "settings": assumed}
+    report: dict[str, Any] = {"model": str(path), "shape": model.shape, "settings": assumed}
     report |= _pairs_report(predictions, examples, keys, settings, arguments.exact_poses)
+    report["worst_pairs"] = _worst_pairs(datasets, report["pairs"], keys, predictions)
     report["trajectories"] = _trajectories(recordings, model, arguments)
     print("\n".join(_tables(report)))
     if arguments.json is not None:
@@ -257,6 +258,7 @@ def _pairs_report(
     """Return the pose check, the figures without the flagged pairs and with all, and every KL."""
     from cello3d_ros.learning.comparison import compare, divergences
     from cello3d_ros.learning.evaluation import pose_check
+    from cello3d_ros.learning.evidence import calibration, fits
 
     checks = [pose_check(xi) for xi in examples.xi]
     for (name, _, _), check in zip(keys, checks, strict=True):
@@ -269,11 +271,38 @@ def _pairs_report(
         everything = compare(predictions, examples, np.ones_like(flagged), settings)
         report["with_flagged_pairs"] = {k: everything[k] for k in ("n_pairs", "methods")}
     report["pose_check"] = _pose_checks(keys, checks)
+    report["calibration"] = calibration(predictions, examples, ~flagged)
     report["pairs"] = [
-        {"recording": name, "i": i, "j": j, **check, "kl": divergences(predictions, examples, k)}
+        {
+            **{"recording": name, "i": i, "j": j},
+            **check,
+            "kl": divergences(predictions, examples, k),
+            "dm2_over_6": fits(predictions, examples, k),
+        }
         for k, ((name, i, j), check) in enumerate(zip(keys, checks, strict=True))
     ]
     return report
+
+
+def _worst_pairs(
+    datasets: Sequence[Dataset],
+    pairs: list[dict[str, Any]],
+    keys: list[tuple[str, int, int]],
+    predictions: Predictions,
+) -> list[dict[str, Any]]:
+    """Return what there is to see of the pairs whose covariances the model misses most."""
+    from cello3d_ros.learning.evidence import N_WORST, seen
+
+    order = sorted(
+        (k for k, pair in enumerate(pairs) if not pair["flagged"]),
+        key=lambda k: -pairs[k]["kl"]["model"],
+    )
+    holders = {key: dataset for dataset in datasets for key in dataset.pair_keys()}
+    return [
+        seen(holders[keys[k]].read(*keys[k]), predictions.covariances["model"][k])
+        | {"kl": pairs[k]["kl"]["model"]}
+        for k in order[:N_WORST]
+    ]
 
 
 def _pose_checks(
@@ -300,6 +329,7 @@ def _pose_checks(
 def _trajectories(
     recordings: dict[str, Recording], model: Model, arguments: argparse.Namespace
 ) -> dict[str, Any]:
+    from cello3d_ros.learning.evidence import drawn
     from cello3d_ros.learning.online import prepared
     from cello3d_ros.learning.trajectories import consistency, length_m, odometry_runs
 
@@ -317,7 +347,7 @@ def _trajectories(
             arguments.seed,
             arguments.jobs,
         )
-        report[name] = {"length_m": length_m(T), **consistency(runs)}
+        report[name] = {"length_m": length_m(T), **consistency(runs), "paths": drawn(T, runs)}
     return report
 
 

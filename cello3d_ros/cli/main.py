@@ -19,6 +19,8 @@ VERBS = {
     "sample": "sample ICP on every pair of recordings into a dataset",
     "train": "learn a model from datasets",
     "evaluate": "judge covariances beside every baseline",
+    "report": "turn an evaluation into one page to look at",
+    "reproduce": "make the paper's tables and figures again",
     "replay": "run the estimator over a recording, without ROS",
     "demo": "replay a bag through the node and judge its answers",
 }

@@ -30,12 +30,14 @@ class Runs(NamedTuple):
 
     xi: (n, 6), ``log(T_true^-1 T_final)``; Y: (n, 6, 6), right; lost: (n,), whether a registration
     of the run ended in another minimum; n_failed: runs in which one had no answer.
+    paths: for each of the n, the pose at every scan but the first, in the frame of the first.
     """
 
     xi: Array
     Y: Array
     lost: NDArray[np.bool_]
     n_failed: int
+    paths: tuple[list[GaussianPose], ...] = ()
 
 
 def odometry_runs(
@@ -53,34 +55,39 @@ def odometry_runs(
     own covariance predicted.  A run does not depend on the others or on the threads.
     """
 
-    def one(run: int) -> tuple[GaussianPose, bool] | None:
+    def one(run: int) -> tuple[list[GaussianPose], bool] | None:
         return _run(clouds, T_world_sensor, model, np.random.default_rng([seed, run]))
 
     if n_threads <= 1:
-        finals = [one(run) for run in range(n_runs)]
+        runs = [one(run) for run in range(n_runs)]
     else:
         with ThreadPoolExecutor(n_threads) as pool:
-            finals = list(pool.map(one, range(n_runs)))
-    reached = [final for final in finals if final is not None]
+            runs = list(pool.map(one, range(n_runs)))
+    reached = [run for run in runs if run is not None]
     T_true = inverse(T_world_sensor[0]) @ T_world_sensor[-1]
-    xi = log(inverse(T_true) @ np.array([final.T for final, _ in reached]).reshape(-1, 4, 4))
-    Y = np.array([final.Y for final, _ in reached]).reshape(-1, 6, 6)
+    xi = log(inverse(T_true) @ np.array([path[-1].T for path, _ in reached]).reshape(-1, 4, 4))
+    Y = np.array([path[-1].Y for path, _ in reached]).reshape(-1, 6, 6)
     lost = np.array([lost for _, lost in reached], np.bool_)
-    return Runs(xi, Y, lost, n_runs - len(reached))
+    return Runs(xi, Y, lost, n_runs - len(reached), tuple(path for path, _ in reached))
 
 
 def compound_chain(steps: Sequence[GaussianPose]) -> GaussianPose:
-    """Return the pose of all steps after each other, right covariance, to 4th order.
+    """Return the pose of all steps after each other, right covariance, to 4th order."""
+    return compound_path(steps)[-1]
+
+
+def compound_path(steps: Sequence[GaussianPose]) -> list[GaussianPose]:
+    """Return the pose after each step, right covariance, to 4th order.
 
     Where the 4th order is not positive definite (spread of a radian) a step is of 2nd order.
     """
-    total = steps[0]
+    path = [steps[0]]
     for step in steps[1:]:
-        longer = compound_right(*total, *step)
+        longer = compound_right(*path[-1], *step)
         if not is_positive_definite(longer.Y):
-            longer = compound_right(*total, *step, order=2)
-        total = longer
-    return total
+            longer = compound_right(*path[-1], *step, order=2)
+        path.append(longer)
+    return path
 
 
 def consistency(runs: Runs) -> dict[str, Any]:
@@ -124,8 +131,8 @@ def length_m(T_world_sensor: Array) -> float:
 
 def _run(
     clouds: Sequence[Cloud], T_world_sensor: Array, model: Model, rng: np.random.Generator
-) -> tuple[GaussianPose, bool] | None:
-    """Return the final pose of one odometry and whether it got lost; None without an answer."""
+) -> tuple[list[GaussianPose], bool] | None:
+    """Return the poses of one odometry and whether it got lost; None without an answer."""
     sampling = model.sampling
     steps, lost = [], False
     for k in range(1, len(clouds)):
@@ -140,4 +147,4 @@ def _run(
         xi = log(inverse(T_mean) @ T_hat)
         lost |= bool(np.linalg.norm(xi[:3]) > _LOST * sampling.cluster_scale_m)
         lost |= bool(np.linalg.norm(xi[3:]) > _LOST * sampling.cluster_scale_rad)
-    return compound_chain(steps), lost
+    return compound_path(steps), lost

@@ -22,8 +22,11 @@ from cello3d_ros.recordings.paths import Route, smooth
 Ground = Callable[[ArrayLike], Array]  # (..., 2) -> (...,), height in metres
 
 
-def garden(rng: np.random.Generator) -> tuple[Mesh, Route]:
-    """Build a pavilion that the route runs through, trees, hedges and a garden wall."""
+def garden(rng: np.random.Generator, foliage: float = 1.0) -> tuple[Mesh, Route]:
+    """Build a pavilion that the route runs through, trees, hedges and a garden wall.
+
+    foliage: share of the leaves that hang; another share leaves everything else where it is.
+    """
     ground = uneven_ground(rng, wavelengths_m=(8.0, 30.0), std_m=0.18)
     ring = _ring(rng, radius_m=rng.uniform(7.5, 11.0), wobble=0.15)
     route = _route(ring, ground)
@@ -37,23 +40,27 @@ def garden(rng: np.random.Generator) -> tuple[Mesh, Route]:
     ]
     for place in places(rng, 30, 2.0 * edge, 2.5):
         if route.distance(place) > 1.2 and np.linalg.norm(place - center[:2]) > 4.5:
-            parts.append(_plant(np.array([*place, ground(place)]), route, rng))
+            parts.append(_plant(np.array([*place, ground(place)]), route, rng, foliage))
     return clear_of(route, join(parts)), route
 
 
-def _plant(foot: Array, route: Route, rng: np.random.Generator) -> Mesh:
-    """Return a tree, a bush or a cut hedge."""
+def _plant(foot: Array, route: Route, rng: np.random.Generator, foliage: float) -> Mesh:
+    """Return a tree, a bush or a cut hedge, which keeps its leaves."""
     kind = rng.uniform()
     if kind < 0.6:
-        return tree(foot, rng.uniform(4.0, 8.0), 220, route, rng)
+        return tree(foot, rng.uniform(4.0, 8.0), 220, route, rng, foliage)
     if kind < 0.85:
-        return facets(raised(foot, 0.4), rng.uniform(0.4, 0.8, size=3), 150, 0.1, rng)
+        bush = facets(raised(foot, 0.4), rng.uniform(0.4, 0.8, size=3), 150, 0.1, rng)
+        return _thinned(bush, foliage)
     size = [rng.uniform(1.0, 2.0), rng.uniform(0.3, 0.6), rng.uniform(0.6, 1.4)]
     return box(raised(foot, 0.3), size, rng.uniform(0, np.pi))
 
 
-def wood(rng: np.random.Generator) -> tuple[Mesh, Route]:
-    """Build a wood: trunks with branches and foliage, bushes, fallen logs, rough ground."""
+def wood(rng: np.random.Generator, foliage: float = 1.0) -> tuple[Mesh, Route]:
+    """Build a wood: trunks with branches and foliage, bushes, fallen logs, rough ground.
+
+    foliage: as that of ``garden``.
+    """
     ground = uneven_ground(rng, wavelengths_m=(3.0, 25.0), std_m=rng.uniform(0.2, 0.4))
     ring = _ring(rng, radius_m=rng.uniform(9.0, 14.0), wobble=0.25)
     route = _route(ring, ground)
@@ -62,10 +69,11 @@ def wood(rng: np.random.Generator) -> tuple[Mesh, Route]:
         if route.distance(place) < 0.8:
             continue
         foot = np.array([*place, ground(place)])
-        parts.append(tree(foot, rng.uniform(5.0, 13.0), 160, route, rng))
+        parts.append(tree(foot, rng.uniform(5.0, 13.0), 160, route, rng, foliage))
     for place in places(rng, 60, 50.0, 1.0):
         foot = np.array([*place, ground(place) + 0.3])
-        parts.append(facets(foot, rng.uniform(0.3, 0.9, size=3), 90, 0.1, rng))
+        bush = facets(foot, rng.uniform(0.3, 0.9, size=3), 90, 0.1, rng)
+        parts.append(_thinned(bush, foliage))
     for place in places(rng, 6, 40.0, 3.0):
         along = rng.normal(size=2)
         end = place + rng.uniform(2.0, 5.0) * along / np.linalg.norm(along)
@@ -124,7 +132,12 @@ def places(rng: np.random.Generator, n: int, side_m: float, apart_m: float) -> A
 
 
 def tree(
-    foot: Array, height: float, n_leaves: int, route: Route, rng: np.random.Generator
+    foot: Array,
+    height: float,
+    n_leaves: int,
+    route: Route,
+    rng: np.random.Generator,
+    foliage: float = 1.0,
 ) -> Mesh:
     """Return a leaning trunk with branches, none across the route, and foliage at their ends."""
     radius = rng.uniform(0.07, 0.26)
@@ -139,8 +152,14 @@ def tree(
         if base[2] - foot[2] > 3.5 or min(route.distance(np.linspace(base, end, 9)[:, :2])) > 0.6:
             parts.append(frustum(base, end, 0.25 * radius, 0.1 * radius, 5))
         blob = rng.uniform(0.4, 0.9, size=3) * max(0.8, 0.12 * height)
-        parts.append(facets(end, blob, n_leaves // n_branches, 0.14, rng))
+        leaves = facets(end, blob, n_leaves // n_branches, 0.14, rng)
+        parts.append(_thinned(leaves, foliage))
     return join(parts)
+
+
+def _thinned(leaves: Mesh, share: float) -> Mesh:
+    """Return the first of some leaves, which were drawn in no order."""
+    return Mesh(leaves.vertices, leaves.triangles[: round(share * len(leaves.triangles))])
 
 
 def _pavilion(center: Array, route: Route, rng: np.random.Generator) -> Mesh:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -35,6 +36,9 @@ WORLDS: MappingProxyType[str, Builder] = MappingProxyType(
         "stairs": staircase.stairs,
         "garden": outdoor.garden,
         "wood": outdoor.wood,
+        # the same places in another season, for the same seed
+        "garden_winter": partial(outdoor.garden, foliage=0.08),
+        "wood_autumn": partial(outdoor.wood, foliage=0.35),
     }
 )
 

@@ -16,22 +16,33 @@ The rules are those of libpointmatcher, so that results can be compared number b
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from queue import SimpleQueue
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import overload
 
 from cello3d_ros.clouds.filters import subsample
 from cello3d_ros.clouds.neighbors import Indices
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.registration.candidates import (
+    Candidates,
+    Places,
+    make_candidates,
+    make_room,
+    nearest,
+)
 from cello3d_ros.registration.search import Leaves, build_leaves, search, tree_order
 
 REASONS = ("", "max_iterations", "singular", "too_few_points")
 _SLACK = 1.2  # search beyond the last trim limit, in squared distance
+_MANY = 50  # registrations of one thread, from which on lists of candidates pay
+_LARGEST_M = 1e6  # coordinate of the reference, so that float32 holds all distances
 _N_BINS = 2048  # of the trim limit's histogram
 _CONVERGED, _MAX_ITERATIONS, _SINGULAR, _TOO_FEW_POINTS = range(4)
 
@@ -53,12 +64,12 @@ class Registration(NamedTuple):
 
 
 class _Pair(NamedTuple):
-    """Two sets of points as the kernels want them: in tree order, about the reference's mean."""
+    """Two sets of points as the kernels want them: about the reference's mean."""
 
     reading: Array
     reference: Array
     normals: Array
-    leaves: Leaves
+    near: Leaves | Places
     mean: Array
 
 
@@ -71,7 +82,8 @@ def icp(
     Never raises on geometry: a registration without an answer keeps the last pose it had and
     says why.
     """
-    return _register_pair(_pair(reading, reference, normals), T_init, config)
+    reading = np.ascontiguousarray(reading)
+    return _icp_in_order(reading[tree_order(reading)], reference, normals, T_init, config)
 
 
 def register(
@@ -84,7 +96,9 @@ def register(
     """Register random subsamples of two clouds, drawn anew: they are part of ICP's noise."""
     read = subsample(len(reading.points), config.n_reading_points, rng)
     ref = subsample(len(reference.points), config.n_reference_points, rng)
-    return icp(reading.points[read], reference.points[ref], reference.normals[ref], T_init, config)
+    return _icp_in_order(
+        reading.points[read], reference.points[ref], reference.normals[ref], T_init, config
+    )
 
 
 def register_many(
@@ -95,52 +109,76 @@ def register_many(
     config: IcpConfig,
     n_threads: int = 1,
 ) -> list[Registration]:
-    """Register from many starts, each with subsamples of its own.
+    """Register from many starts, each with subsamples of its own, as ``register`` does.
 
     T_inits: (n, 4, 4); seeds: n seeds of numpy's default generator.  Each result depends on its
-    own start and seed only, hence not on the number of threads.  Where the clouds are small
-    enough for every subsample to be the whole of both, they are put in order once.
+    own start and seed only, hence not on the number of threads.  Where each draws the whole
+    reference, many registrations share lists of candidates, which each thread makes for itself.
     """
-    whole = None
-    if (
-        len(reading.points) <= config.n_reading_points
-        and 0 < len(reference.points) <= config.n_reference_points
-    ):
-        whole = _pair(reading.points, reference.points, reference.normals)
+    n, n_threads = len(T_inits), max(n_threads, 1)
+    mean = reference.points.mean(axis=0)
+    points = reference.points - mean
+    is_shared = n >= _MANY * n_threads and _can_share(points, config)
+    rooms: SimpleQueue[Candidates | None] = SimpleQueue()
+    for _ in range(n_threads):
+        rooms.put(make_candidates(points, config.n_neighbors) if is_shared else None)
 
     def one(i: int) -> Registration:
-        if whole is not None:
-            return _register_pair(whole, T_inits[i], config)
-        rng = np.random.default_rng(seeds[i])
-        return register(reading, reference, T_inits[i], config, rng)
+        rng, candidates = np.random.default_rng(seeds[i]), rooms.get()
+        try:
+            if candidates is None:
+                return register(reading, reference, T_inits[i], config, rng)
+            make_room(candidates)
+            read = subsample(len(reading.points), config.n_reading_points, rng)
+            index = Places(candidates, np.zeros(len(read), np.int32))
+            pair = _Pair(reading.points[read], points, reference.normals, index, mean)
+            return _register_pair(pair, T_inits[i], config)
+        finally:
+            rooms.put(candidates)
 
-    if n_threads <= 1:
-        return [one(i) for i in range(len(T_inits))]
+    if n_threads == 1:
+        return [one(i) for i in range(n)]
     with ThreadPoolExecutor(n_threads) as pool:
-        return list(pool.map(one, range(len(T_inits))))
+        return list(pool.map(one, range(n)))
 
 
-def _pair(reading: Array, reference: Array, normals: Array) -> _Pair:
-    if len(reading) == 0 or len(reference) == 0:
-        none = np.empty((0, 3))
-        return _Pair(none, none, none, build_leaves(np.zeros((1, 3))), np.zeros(3))
+def _can_share(points: Array, config: IcpConfig) -> bool:
+    """Return whether lists of candidates serve all registrations of a reference, and its size."""
+    return bool(
+        16 * config.n_neighbors <= len(points) <= config.n_reference_points
+        and config.n_neighbors <= 16
+        and np.abs(points).max() < _LARGEST_M
+    )
+
+
+def _icp_in_order(
+    reading: Array, reference: Array, normals: Array, T_init: Array, config: IcpConfig
+) -> Registration:
+    """Register points, those of the reading in an order in which neighbours are near in space."""
+    if len(reading) == 0 or len(reference) < config.n_neighbors:
+        return _too_few(T_init)
     mean = reference.mean(axis=0)
-    reading, reference = np.ascontiguousarray(reading), reference - mean
-    read, ref = tree_order(reading), tree_order(reference)
-    reference = reference[ref]
-    return _Pair(reading[read], reference, normals[ref], build_leaves(reference), mean)
+    centered = reference - mean
+    order = tree_order(centered)
+    centered = centered[order]
+    leaves = build_leaves(centered, order)
+    return _register_pair(_Pair(reading, centered, normals[order], leaves, mean), T_init, config)
+
+
+def _too_few(T_init: Array) -> Registration:
+    return Registration(T_init.copy(), 0, False, REASONS[_TOO_FEW_POINTS], math.nan, 0)
 
 
 def _register_pair(pair: _Pair, T_init: Array, config: IcpConfig) -> Registration:
-    if len(pair.reading) == 0 or len(pair.reference) < config.n_neighbors:
-        return Registration(T_init.copy(), 0, False, REASONS[_TOO_FEW_POINTS], math.nan, 0)
+    if len(pair.reading) == 0:
+        return _too_few(T_init)
     T = T_init.copy()
     T[:3, 3] -= pair.mean
     status, n_iterations, rms, n_kept = _icp(
         pair.reading,
         pair.reference,
         pair.normals,
-        pair.leaves,
+        pair.near,
         T,
         config.n_neighbors,
         config.trim_ratio,
@@ -154,12 +192,30 @@ def _register_pair(pair: _Pair, T_init: Array, config: IcpConfig) -> Registratio
     return Registration(T, n_iterations, status == _CONVERGED, REASONS[status], rms, n_kept)
 
 
+def _find(
+    moved: Array, index: Leaves | Places, cap2: float, distances2: Array, indices: Indices
+) -> int:
+    """Fill the k nearest points at most ``cap2`` away, squared, by one index or the other."""
+    find: Callable[..., int] = search if isinstance(index, Leaves) else nearest
+    return find(moved, index, cap2, distances2, indices)
+
+
+@overload(_find, strict=False)
+def _find_compiled(
+    moved: Any, index: Any, cap2: Any, distances2: Any, indices: Any
+) -> Callable[..., int]:
+    find = search if index.instance_class is Leaves else nearest
+    return lambda moved, index, cap2, distances2, indices: find(
+        moved, index, cap2, distances2, indices
+    )
+
+
 @njit(cache=True, nogil=True)
 def _icp(
     reading: Array,
     reference: Array,
     normals: Array,
-    leaves: Leaves,
+    index: Leaves | Places,
     T: Array,
     k: int,
     trim_ratio: float,
@@ -181,7 +237,7 @@ def _icp(
     rms, n_kept, limit = np.nan, 0, np.inf
     for iteration in range(max_iterations):
         moved = start @ R.T + t
-        limit = _associate(moved, leaves, trim_ratio, limit, distances2, indices)
+        limit = _associate(moved, index, trim_ratio, limit, distances2, indices)
         if to_plane:
             ok, dR, dt, rms, n_kept = _plane_step(
                 moved, reference, normals, distances2, indices, limit
@@ -209,7 +265,7 @@ def _icp(
 @njit(cache=True, nogil=True)
 def _associate(
     moved: Array,
-    leaves: Leaves,
+    index: Leaves | Places,
     trim_ratio: float,
     last_limit: float,
     distances2: Array,
@@ -224,9 +280,9 @@ def _associate(
     """
     rank = min(int(distances2.size * trim_ratio), distances2.size - 1)
     cap2 = _SLACK * last_limit
-    if search(moved, leaves, cap2, distances2, indices) <= rank:
+    if _find(moved, index, cap2, distances2, indices) <= rank:
         cap2 = np.inf
-        search(moved, leaves, cap2, distances2, indices)
+        _find(moved, index, cap2, distances2, indices)
     return _of_rank(distances2.ravel(), rank, cap2)
 
 

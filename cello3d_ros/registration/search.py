@@ -8,20 +8,19 @@ each run of sixteen is a leaf, each run of sixteen boxes a node.
 Why the answers are exact: a box or a point is left out only when it is beyond a distance that is
 known to hold k points.  Box distances are rounded like point distances and every operation is
 monotone, so that a box is never farther than a point in it.  Of equally far points the first in
-order wins, so that the answer does not depend on the way the tree is walked.
+the order they were given in wins, so that the answer does not depend on the tree.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 
 from cello3d_ros.clouds.neighbors import Indices, select
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.registration.lanes import lowest_bit
 
 _WIDTH = 16  # children of a node, points of a leaf
 _FAR2 = 1.7e308  # below infinity, so that empty lanes are never near
@@ -32,12 +31,14 @@ class Leaves(NamedTuple):
 
     points: (L, 3, 16), point p being lane p % 16 of leaf p // 16, empty lanes infinite; boxes:
     (B, 6, 16), least and greatest coordinates of each node's children, the root last; children:
-    (B,), each node's first child: a leaf below L, node c - L otherwise.
+    (B,), each node's first child: a leaf below L, node c - L otherwise; order: (N,) the points'
+    rank where they are equally far.
     """
 
     points: Array
     boxes: Array
     children: Indices
+    order: Indices
 
 
 @njit(cache=True, nogil=True)
@@ -81,8 +82,8 @@ def tree_order(points: Array) -> Indices:
 
 
 @njit(cache=True, nogil=True)
-def build_leaves(points: Array) -> Leaves:
-    """Build the tree of (N, 3) points, N > 0, given in ``tree_order``."""
+def build_leaves(points: Array, order: Indices) -> Leaves:
+    """Build the tree of (N, 3) points, N > 0, given in their ``tree_order``."""
     n = len(points)
     n_leaves = (n + _WIDTH - 1) // _WIDTH
     lanes = np.full((n_leaves, 3, _WIDTH), np.inf)
@@ -107,7 +108,7 @@ def build_leaves(points: Array) -> Leaves:
         for i in range(size):
             children[start + i] = below + _WIDTH * i
         if size == 1:
-            return Leaves(lanes, boxes, children)
+            return Leaves(lanes, boxes, children, order)
         for i in range(size):
             node, child = start + size + i // _WIDTH, i % _WIDTH
             for a in range(3):
@@ -127,7 +128,7 @@ def search(moved: Array, leaves: Leaves, cap2: float, distances2: Array, indices
     farther from the box around them than the farthest bound of them all concerns none of them.
     Each of them then compares itself with those leaves only, not with the tree.
     """
-    points, boxes, children = leaves
+    points, boxes, children, order = leaves
     n, k = indices.shape
     n_leaves = len(points)
     near = np.empty(n_leaves, np.int64)  # the leaves near eight queries, and their boxes
@@ -166,7 +167,7 @@ def search(moved: Array, leaves: Leaves, cap2: float, distances2: Array, indices
             node = stack[top]
             mask = _boxes_near_box(boxes, node, x0, y0, z0, x1, y1, z1, far2)
             while mask:
-                lane = _lowest_bit(mask)
+                lane = lowest_bit(mask)
                 mask &= mask - 1
                 child = children[node] + lane
                 if child >= n_leaves:
@@ -190,14 +191,14 @@ def search(moved: Array, leaves: Leaves, cap2: float, distances2: Array, indices
             for block in range(n_blocks):
                 mask = _boxes_near_point(near_boxes, block, x, y, z, bound2)
                 while mask:
-                    leaf = near[16 * block + _lowest_bit(mask)]
+                    leaf = near[16 * block + lowest_bit(mask)]
                     mask &= mask - 1
                     hits = _points_near(points, leaf, x, y, z, bound2)
                     while hits:
-                        lane = _lowest_bit(hits)
+                        lane = lowest_bit(hits)
                         hits &= hits - 1
                         d2 = _distance2(points, leaf, lane, x, y, z)
-                        _insert(distances2, indices, i, d2, 16 * leaf + lane)
+                        _insert(distances2, indices, i, d2, 16 * leaf + lane, order)
                     bound2 = min(bound2, distances2[i, k - 1])
             for j in range(k):
                 total += indices[i, j] >= 0
@@ -205,18 +206,6 @@ def search(moved: Array, leaves: Leaves, cap2: float, distances2: Array, indices
                 for j in range(k):
                     last[j] = indices[i, j]
     return total
-
-
-def _trailing_zeros(_: Any, __: Any) -> Any:
-    """Compile to the one instruction that finds the lowest bit that is set."""
-
-    def codegen(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.int64(types.int64), codegen
-
-
-_lowest_bit: Any = intrinsic(_trailing_zeros)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -227,13 +216,16 @@ def _distance2(points: Array, leaf: int, lane: int, x: float, y: float, z: float
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _insert(distances2: Array, indices: Indices, i: int, d2: float, p: int) -> None:
+def _insert(
+    distances2: Array, indices: Indices, i: int, d2: float, p: int, order: Indices
+) -> None:
     """Put a point in its place among the neighbours of query i, the farthest falls out."""
     j = distances2.shape[1] - 1
-    if d2 > distances2[i, j] or (d2 == distances2[i, j] and p > indices[i, j] >= 0):
+    if d2 > distances2[i, j] or (d2 == distances2[i, j] and order[p] > order[indices[i, j]]):
         return
     while j > 0 and (
-        d2 < distances2[i, j - 1] or (d2 == distances2[i, j - 1] and p < indices[i, j - 1])
+        d2 < distances2[i, j - 1]
+        or (d2 == distances2[i, j - 1] and order[p] < order[indices[i, j - 1]])
     ):
         distances2[i, j], indices[i, j] = distances2[i, j - 1], indices[i, j - 1]
         j -= 1

@@ -117,6 +117,38 @@ def test_figures_are_written_and_printed(folder: Path, capsys: pytest.CaptureFix
     assert sorted(path.name for path in folder.iterdir()) == ["e.json", "model.npz", "set"]
 
 
+def test_what_a_report_draws_is_written(folder: Path, walk: Path) -> None:
+    words = ("--only", "walk", "--recordings", walk, "--registrations", 10, "--jobs", 1)
+    out = ("--trajectories", 3, "--json", folder / "e.json")
+    assert evaluate(folder, *words, *out) == 0
+    report = json.loads((folder / "e.json").read_text())
+    errors = np.concatenate([record("walk", i).xi for i in range(2)])
+    Y = [record("walk", i).covariance for i in range(2)]
+    dm2 = [x @ np.linalg.solve(Y[k // 60], x) for k, x in enumerate(errors)]
+    quantiles = dict(
+        zip(report["calibration"]["probabilities"], report["calibration"]["dm2"]["model"])
+    )
+    assert quantiles[0.5] == pytest.approx(np.median(dm2))
+    assert quantiles[0.95] == pytest.approx(np.quantile(dm2, 0.95))
+    pair = report["pairs"][0]
+    assert pair["dm2_over_6"]["model"] == pytest.approx(1.0)
+    assert pair["dm2_over_6"]["sandwich"] == pytest.approx(4.0)
+    assert set(pair["dm2_over_6"]) == set(pair["kl"])
+    worst = report["worst_pairs"]
+    assert sorted((w["recording"], w["i"], w["j"]) for w in worst) == [
+        ("walk", 0, 1),
+        ("walk", 1, 2),
+    ]
+    np.testing.assert_allclose(worst[0]["xi"], record("walk", worst[0]["i"]).xi, atol=1e-7)
+    np.testing.assert_allclose(worst[0]["predicted"], worst[0]["covariance"])
+    assert worst[0]["kl"] >= worst[1]["kl"]
+    paths = report["trajectories"]["walk"]["paths"]
+    np.testing.assert_allclose(paths["truth"][2], exp([0.6, 0.2, 0, 0, 0, 0.2])[:3, 3], atol=1e-4)
+    np.testing.assert_allclose(np.mean(paths["positions"], axis=0), paths["truth"][1:], atol=0.05)
+    assert np.shape(paths["covariances"]) == (3, 2, 3, 3)
+    assert (np.linalg.eigvalsh(paths["covariances"]) > 0.0).all()
+
+
 def test_pairs_with_suspected_poses_are_named_and_left_out(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

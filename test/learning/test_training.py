@@ -325,7 +325,11 @@ def test_the_order_of_the_examples_does_not_change_predictions() -> None:
 
 SGD = TrainingConfig(
     features="descriptor",
-    shape="none", theta="diagonal", mean_weight=0.0, regularization=1e-3, optimizer="sgd"
+    shape="none",
+    theta="diagonal",
+    mean_weight=0.0,
+    regularization=1e-3,
+    optimizer="sgd",
 )
 
 

@@ -100,6 +100,13 @@ def test_odometry_ends_near_the_truth_whatever_the_threads(walk):
     assert 0.0 < np.abs(runs.xi).max() < 0.05
     assert len(np.unique(runs.xi[:, 0])) == 4  # each run draws its own
     assert (np.linalg.eigvalsh(runs.Y)[:, 0] > 1e-4).all()  # of two steps
+    assert [len(path) for path in runs.paths] == [2, 2, 2, 2]
+    T_true = inverse(walk[1][0]) @ walk[1][1]
+    for path, xi, Y in zip(runs.paths, runs.xi, runs.Y, strict=True):
+        assert np.abs(log(inverse(T_true) @ path[0].T)).max() < 0.05
+        T_end = inverse(walk[1][0]) @ walk[1][2]
+        np.testing.assert_allclose(path[-1].T @ exp(-xi), T_end, atol=1e-12)
+        np.testing.assert_array_equal(path[-1].Y, Y)
 
 
 def test_lost_and_failed_runs_are_counted(walk, monkeypatch):

@@ -61,6 +61,25 @@ def test_no_foliage_hangs_into_the_way(world: str) -> None:
     assert ((distance < 3.0) & (above > 0.4)).sum() > 50  # but there is some beside it
 
 
+@pytest.mark.parametrize(
+    ("summer", "other", "least", "most"),
+    [("garden", "garden_winter", 0.05, 0.12), ("wood", "wood_autumn", 0.3, 0.4)],
+)
+def test_another_season_is_the_same_place_with_fewer_leaves(
+    summer: str, other: str, least: float, most: float
+) -> None:
+    full, thin = (build_world(name, np.random.default_rng(4)) for name in (summer, other))
+    assert np.array_equal(full.route.points, thin.route.points)
+    assert np.array_equal(full.mesh.vertices, thin.mesh.vertices)
+    kept = {tuple(t) for t in thin.mesh.triangles}
+    everything = {tuple(t) for t in full.mesh.triangles}
+    assert kept < everything
+    uses = np.bincount(full.mesh.triangles.ravel())  # a leaf shares no corner
+    assert (uses[sorted(everything - kept)] == 1).all()  # nothing but leaves fell
+    n_leaves = (uses[full.mesh.triangles] == 1).all(axis=1).sum()
+    assert least < 1.0 - len(everything - kept) / n_leaves < most
+
+
 @pytest.mark.parametrize("world", WORLDS)
 def test_another_seed_builds_another_layout_of_another_size(world: str) -> None:
     meshes = [build_world(world, np.random.default_rng(seed)).mesh for seed in (0, 1)]

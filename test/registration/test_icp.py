@@ -8,6 +8,8 @@ from scipy.spatial.transform import Rotation
 from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import CloudConfig, IcpConfig
 from cello3d_ros.geometry.se3 import exp, inverse, log, transform
+from cello3d_ros.registration import icp as module
+from cello3d_ros.registration.candidates import make_candidates
 from cello3d_ros.registration.icp import icp, register, register_many
 
 
@@ -170,15 +172,27 @@ def test_each_of_many_registrations_depends_on_its_own_seed_only(room):
     assert not np.array_equal(other.T_ref_read, alone.T_ref_read)
 
 
-def test_whole_clouds_put_in_order_once_give_the_same_bits(room):
+@pytest.mark.parametrize("n_reading_points", [300, 10**6])
+@pytest.mark.parametrize("n_threads", [1, 2])
+def test_registrations_that_share_a_reference_give_the_same_bits(
+    room, n_reading_points, n_threads, monkeypatch
+):
+    shared = []
+    monkeypatch.setattr(
+        module, "make_candidates", lambda *a: shared.append(make_candidates(*a)) or shared[-1]
+    )
     rng = np.random.default_rng(16)
     reading, reference = (prepare(scan, CloudConfig(), rng) for scan in room)
-    config = IcpConfig(n_reading_points=10**6, n_reference_points=10**6)
-    starts = exp(rng.normal(scale=0.1, size=(3, 6)))
-    many = register_many(reading, reference, starts, [[i] for i in range(3)], config, n_threads=2)
-    for T_init, found in zip(starts, many):
-        alone = register(reading, reference, T_init, config, np.random.default_rng(0))
-        np.testing.assert_array_equal(found.T_ref_read, alone.T_ref_read)
+    config = IcpConfig(n_reading_points=n_reading_points, n_reference_points=10**6)
+    starts = exp(rng.normal(scale=0.1, size=(120, 6)))
+    seeds = [[3, i] for i in range(120)]
+    many = register_many(reading, reference, starts, seeds, config, n_threads)
+    assert len(shared) == n_threads
+    assert all(candidates.used[0] > 100 for candidates in shared)
+    for i in range(0, 120, 10):
+        alone = register(reading, reference, starts[i], config, np.random.default_rng(seeds[i]))
+        np.testing.assert_array_equal(many[i].T_ref_read, alone.T_ref_read)
+        assert many[i][1:] == alone[1:]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from cello3d_ros.registration.candidates import Places, make_candidates, make_room, nearest
 from cello3d_ros.registration.icp import _of_rank
 from cello3d_ros.registration.search import build_leaves, search, tree_order
 
@@ -43,7 +44,7 @@ def test_the_search_finds_what_sorting_all_distances_finds(case, k):
     rng = np.random.default_rng(21)
     points = CASES[case](rng)
     points = points[tree_order(points)]
-    leaves = build_leaves(points)
+    leaves = build_leaves(points, np.arange(len(points)))
     queries = np.vstack([points[:200], points.mean(axis=0) + 2 * rng.normal(size=(101, 3))])
     queries[7] += 1e7
     distances2, indices = np.full((len(queries), k), np.inf), np.full((len(queries), k), -1)
@@ -57,12 +58,78 @@ def test_the_search_finds_what_sorting_all_distances_finds(case, k):
         assert n_found == (expected >= 0).sum()
 
 
+def test_of_equally_far_points_the_first_given_wins():
+    rng = np.random.default_rng(24)
+    given = rng.integers(0, 4, (500, 3)).astype(float)
+    order = tree_order(given)
+    leaves = build_leaves(given[order], order)
+    queries = rng.integers(0, 4, (100, 3)) + rng.choice([0.0, 0.5], (100, 3))
+    distances2, indices = np.empty((100, 3)), np.full((100, 3), -1)
+    search(queries, leaves, np.inf, distances2, indices)
+    np.testing.assert_array_equal(order[indices], plain(given, queries, 3, np.inf)[1])
+
+
+def assert_candidates_are_exact(points, queries, k, caps, rng, **room):
+    candidates = make_candidates(points, k, **room)
+    index = Places(candidates, np.zeros(len(queries), np.int32))
+    distances2, indices = np.empty((len(queries), k)), np.empty((len(queries), k), np.int64)
+    for cap2 in caps:
+        n_found = nearest(queries, index, cap2, distances2, indices)
+        expected2, expected = plain(points, queries, k, cap2)
+        np.testing.assert_array_equal(indices, expected)
+        np.testing.assert_array_equal(distances2, expected2)
+        assert n_found == (expected >= 0).sum()
+        queries = queries + 0.02 * rng.normal(size=3) * (cap2 < np.inf)
+    return candidates
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("k", [1, 3, 5])
+def test_candidates_are_what_sorting_all_distances_finds(case, k):
+    rng = np.random.default_rng(25)
+    points = CASES[case](rng)
+    points = points - points.mean(axis=0)
+    queries = np.vstack(
+        [
+            points[:200],  # on points
+            0.5 * (points[:50] + points[-50:][::-1]) if len(points) > 50 else points,
+            2 * rng.normal(size=(200, 3)),
+            np.round(4 * rng.normal(size=(100, 3))) / 4,  # on borders of cubes
+            [[0.0, 0.0, 0.0], [1e7, 0.0, 0.0], [-1e11, 1e11, 3.0]],  # outside of all cubes
+        ]
+    )
+    assert_candidates_are_exact(points, queries, k, (np.inf, 0.5, 0.05, 0.0), rng)
+
+
+def test_candidates_are_exact_where_float32_cannot_tell():
+    """Points on a sphere, their radii equal but for what double precision holds."""
+    rng = np.random.default_rng(26)
+    points = rng.normal(size=(3000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points[::7] += 1e-12 * rng.normal(size=points[::7].shape)
+    ring = np.c_[np.cos(np.arange(40.0)), np.sin(np.arange(40.0)), np.zeros(40)]
+    points = np.vstack([points * (1.0 + 1e-9 * rng.random((3000, 1))), 0.05 * ring])
+    queries = np.vstack([1e-6 * rng.normal(size=(100, 3)), 0.05 * rng.normal(size=(200, 3))])
+    assert_candidates_are_exact(points, queries, 3, (np.inf, 1.1), rng)
+
+
+def test_candidates_are_exact_when_room_is_short_and_start_over():
+    rng = np.random.default_rng(27)
+    points, queries = rng.normal(size=(2000, 3)), rng.normal(size=(1500, 3))
+    full = assert_candidates_are_exact(
+        points, queries, 3, (np.inf,), rng, n_cubes=300, n_numbers=20_000
+    )
+    assert full.used[0] > 290 or full.used[1] > 18_000
+    make_room(full)
+    assert (full.used[0], full.used[1]) == (9, 2000)
+
+
 @pytest.mark.parametrize("n", [1, 15, 16, 17, 255, 256, 257, 300, 4095, 4097, 9000])
 def test_the_order_is_a_permutation_of_compact_runs(n):
     points = np.random.default_rng(22).normal(size=(n, 3))
     order = tree_order(points)
     assert sorted(order) == list(range(n))
-    leaves = build_leaves(points[order])
+    leaves = build_leaves(points[order], order)
     lanes = leaves.points.transpose(0, 2, 1).reshape(-1, 3)
     np.testing.assert_array_equal(lanes[:n], points[order])
     assert np.isinf(lanes[n:]).all()

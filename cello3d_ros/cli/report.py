@@ -1,0 +1,93 @@
+"""``cello3d report EVALUATION.json --out report.html``: one page to look at, without a network."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cello3d_ros.errors import Cello3dError, RecordingError
+
+if TYPE_CHECKING:
+    from cello3d_ros.geometry.se3 import Array
+
+_MOST_POINTS = 6000  # of a cloud on the page: twelve clouds of them are 1.2 MB
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the verb."""
+    parser.add_argument(
+        "evaluation", type=Path, metavar="EVALUATION", help="JSON that cello3d evaluate wrote"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="HTML", help="page to write, self-contained"
+    )
+    parser.add_argument(
+        "--recordings",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="RECORDING",
+        help="bags or data sets with the clouds of the worst pairs",
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Write the page.  Raises EvaluationError for a file that is damaged or too old."""
+    from cello3d_ros.reporting.evaluation_file import EvaluationError, read_evaluation
+    from cello3d_ros.reporting.page import page
+
+    out: Path = arguments.out
+    if out.is_dir() or not out.parent.is_dir():
+        raise Cello3dError(f"cannot write {out}: not a file in an existing folder")
+    report = read_evaluation(arguments.evaluation)
+    try:
+        clouds = _clouds(report["worst_pairs"], arguments.recordings)
+        text = page(report, clouds)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        told = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise EvaluationError(f"{arguments.evaluation} is damaged: {told}") from None
+    partial = out.with_name(f".{out.name}.{os.getpid()}.tmp")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, out)
+    except OSError as error:
+        raise Cello3dError(f"cannot write {out}: {error.strerror or error}") from None
+    finally:
+        partial.unlink(missing_ok=True)
+    print(f"{out}: {len(text.encode()) / 1e6:.1f} MB, {len(clouds)} pairs with clouds")
+
+
+def _clouds(
+    pairs: list[dict[str, Any]], paths: Sequence[str]
+) -> dict[tuple[str, int, int], tuple[Array, Array]]:
+    """Return reading and reference, thinned, of the pairs whose recordings were given."""
+    from cello3d_ros.recordings import open_recording
+
+    found = {}
+    for path in paths:
+        recording = open_recording(path)
+        wanted = [pair for pair in pairs if pair["recording"] == recording.name]
+        needed = {int(k) for pair in wanted for k in (pair["i"], pair["j"])}
+        scans: dict[int, Array] = {}
+        if needed:
+            for k, scan in zip(range(max(needed) + 1), recording):
+                if k in needed:
+                    scans[k] = _thinned(scan.points)
+        if missing := sorted(needed - set(scans)):
+            raise RecordingError(f"{path} has {len(recording)} scans, no scan {missing[0]}")
+        for pair in wanted:
+            i, j = int(pair["i"]), int(pair["j"])
+            found[recording.name, i, j] = (scans[j], scans[i])
+    return found
+
+
+def _thinned(points: Array) -> Array:
+    if len(points) <= _MOST_POINTS:
+        return points
+    kept = np.random.default_rng(0).choice(len(points), _MOST_POINTS, replace=False)
+    return points[np.sort(kept)]

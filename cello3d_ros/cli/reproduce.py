@@ -1,0 +1,177 @@
+"""``cello3d reproduce WHAT``: the paper's tables and figures, with data, pictures and a page."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cello3d_ros.errors import Cello3dError
+
+if TYPE_CHECKING:
+    from cello3d_ros.reproduction.datasets import Recordings, Workshop
+    from cello3d_ros.reproduction.result import Result
+
+#: Registrations of each by default; the paper has 5000 everywhere.
+_N_SAMPLES = {
+    "table1": 200,
+    "table2": 200,
+    "fig-objective": 300,
+    "fig-noise": 200,
+    "fig-cylinder": 3000,
+    "fig-hallway": 2000,
+    "fig-trajectories": 200,
+}
+_ON_RECORDINGS = ("table1", "table2", "fig-trajectories")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the verb."""
+    parser.add_argument("what", choices=[*_N_SAMPLES, "all"], metavar="WHAT", help=_choices())
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("build/reproduce"),
+        metavar="DIR",
+        help="data, pictures and the datasets kept for the next run (build/reproduce)",
+    )
+    parser.add_argument(
+        "--samples",
+        type=_positive,
+        metavar="N",
+        help="registrations of each pair, 5000 in the paper; by default 200 for tables, and what "
+        "a figure needs",
+    )
+    parser.add_argument(
+        "--scans", type=_positive, default=8, metavar="N", help="of a sampled simulation (8)"
+    )
+    parser.add_argument(
+        "--walk", type=_positive, default=25, metavar="N", help="scans of simulated odometry (25)"
+    )
+    parser.add_argument(
+        "--runs", type=_positive, default=100, metavar="N", help="odometries of a sequence (100)"
+    )
+    parser.add_argument(
+        "--data",
+        type=Path,
+        metavar="FOLDER",
+        help="the paper's own sequences, folders or zip archives, in place of simulated ones",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of every random draw")
+    parser.add_argument(
+        "--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N", help="threads"
+    )
+    parser.add_argument(
+        "--results",
+        type=Path,
+        metavar="FILE",
+        help="Markdown page whose sections are written; docs/results.md in a checkout of this "
+        "package, else DIR/results.md",
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Make what was asked for, each published as soon as it is done."""
+    if arguments.seed < 0:
+        raise Cello3dError(f"--seed must not be negative: {arguments.seed}")
+    if arguments.walk < 2:
+        raise Cello3dError("--walk must be at least 2: odometry needs two scans")
+    wanted = list(_N_SAMPLES) if arguments.what == "all" else [arguments.what]
+    if arguments.data and not set(wanted) & set(_ON_RECORDINGS):
+        raise Cello3dError(f"--data is for {', '.join(_ON_RECORDINGS)}, not {arguments.what}")
+    for what in wanted:
+        _make(what, arguments)
+
+
+def _make(what: str, arguments: argparse.Namespace) -> None:
+    from cello3d_ros.reproduction.costs import Costs
+    from cello3d_ros.reproduction.datasets import Workshop
+    from cello3d_ros.reproduction.result import publish
+
+    out: Path = arguments.out
+    n_samples = arguments.samples or _N_SAMPLES[what]
+    folder = out / ("datasets-recorded" if arguments.data else "datasets")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise Cello3dError(f"cannot make {folder}: {error.strerror}") from None
+    costs = Costs(folder / "costs.json")
+    workshop = Workshop(folder, n_samples, arguments.jobs, arguments.seed, costs)
+    start = time.process_time()
+    if what in _ON_RECORDINGS:
+        result = _on_recordings(what, workshop, arguments)
+    else:
+        result = _figure(what)(n_samples, arguments.jobs, arguments.seed)
+    cpu_s = time.process_time() - start + costs.earlier()
+    page = arguments.results or _default_page(out)
+    publish(result, out, page, _command(result.what, arguments), cpu_s)
+    print(f"{result.what}: {cpu_s:.0f} s of processor time; {out}/{result.what}.png, {page}")
+
+
+def _on_recordings(what: str, workshop: Workshop, arguments: argparse.Namespace) -> Result:
+    """Make a table or figure of recordings, the paper's or simulated ones."""
+    from cello3d_ros.reproduction import datasets, table1, table2, trajectories
+
+    training: Recordings
+    if arguments.data:
+        training = walks = datasets.recorded(arguments.data)
+        source = "on the paper's own data"
+    else:
+        training, walks = datasets.simulated(arguments.scans), datasets.simulated(arguments.walk)
+        source = "on simulated counterparts, two recordings of each"
+    if what == "table1":
+        result = table1.make(workshop, training, source)
+    elif what == "table2":
+        result = table2.make(workshop, training, walks, arguments.runs, source)
+    else:
+        result = trajectories.make(workshop, training, walks)
+    if arguments.data:
+        return result._replace(
+            what=f"{what}-recorded", title=f"{result.title}, on the paper's data"
+        )
+    return result
+
+
+def _figure(what: str) -> Callable[[int, int, int], Result]:
+    from cello3d_ros.reproduction import cylinder, hallway, noise, objective
+
+    return {
+        "fig-objective": objective.make,
+        "fig-noise": noise.make,
+        "fig-cylinder": cylinder.make,
+        "fig-hallway": hallway.make,
+    }[what]
+
+
+def _default_page(out: Path) -> Path:
+    manifest = Path("package.xml")
+    is_checkout = manifest.is_file() and "<name>cello3d_ros</name>" in manifest.read_text()
+    return Path("docs/results.md") if is_checkout else out / "results.md"
+
+
+def _command(what: str, arguments: argparse.Namespace) -> str:
+    """Return the command that makes one section again, without what is where it is written."""
+    words = ["cello3d", "reproduce", what.removesuffix("-recorded")]
+    flags: dict[str, object] = {}
+    if arguments.samples is not None:
+        flags["--samples"] = arguments.samples
+    for name, default in (("scans", 8), ("walk", 25), ("runs", 100), ("seed", 0)):
+        if (value := getattr(arguments, name)) != default:
+            flags[f"--{name}"] = value
+    if arguments.data:
+        flags["--data"] = "FOLDER"
+    return " ".join(words + [shlex.quote(str(w)) for item in flags.items() for w in item])
+
+
+def _choices() -> str:
+    return ", ".join([*_N_SAMPLES, "all"])
+
+
+def _positive(word: str) -> int:
+    if (number := int(word)) < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1: {word}")
+    return number

@@ -1,0 +1,121 @@
+"""The paper's seven sequences: their simulated counterparts, and what the paper found on them."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import NamedTuple
+
+
+class PaperTrajectory(NamedTuple):
+    """A row of Table II: length, mean errors, mean D_M of translation, rotation and both."""
+
+    length_m: float
+    error_m: float
+    dm_translation: float
+    error_rad: float
+    dm_rotation: float
+    dm_6dof: float
+
+
+class Sequence(NamedTuple):
+    """One sequence.
+
+    world, seeds: two simulated recordings of the same kind.  The two seasons of a kind have
+    different seeds, so that a model is tested on places that it has not seen; the paper's seasons
+    were of one place.  folder: the name of the sequence in the 'Challenging data sets'.
+    trained_on: keys of the sequences that the paper trained on.  kl_baseline, kl_ours, kl_censi:
+    its Table I; trajectory: its Table II.
+    """
+
+    title: str
+    world: str
+    seeds: tuple[int, int]
+    folder: str
+    trained_on: tuple[str, ...]
+    kl_baseline: float
+    kl_ours: float
+    kl_censi: float
+    trajectory: PaperTrajectory
+
+
+SEQUENCES: MappingProxyType[str, Sequence] = MappingProxyType(
+    {
+        "apartment": Sequence(
+            "Apartment",
+            "rooms",
+            (100, 101),
+            "Apartment",
+            ("hauptgebaude", "stairs"),
+            34.1,
+            26.6,
+            9.19e7,
+            PaperTrajectory(22, 0.115, 0.274, 0.0331, 0.160, 0.540),
+        ),
+        "hauptgebaude": Sequence(
+            "Hauptgebaude",
+            "hall",
+            (100, 101),
+            "ETH Hauptgebaude",
+            ("apartment", "stairs"),
+            34.0,
+            26.7,
+            2.06e8,
+            PaperTrajectory(24, 0.168, 0.467, 0.00910, 0.346, 1.15),
+        ),
+        "stairs": Sequence(
+            "Stairs",
+            "stairs",
+            (100, 101),
+            "Stairs",
+            ("apartment", "hauptgebaude"),
+            33.7,
+            27.0,
+            7.65e7,
+            PaperTrajectory(12, 0.0664, 0.0998, 0.0127, 0.307, 0.592),
+        ),
+        "gazebo_summer": Sequence(
+            "Gazebo Summer",
+            "garden",
+            (100, 101),
+            "Gazebo in summer",
+            ("gazebo_winter",),
+            20.8,
+            19.8,
+            2.55e6,
+            PaperTrajectory(14, 0.0396, 0.278, 0.0165, 0.278, 0.491),
+        ),
+        "gazebo_winter": Sequence(
+            "Gazebo Winter",
+            "garden_winter",
+            (102, 103),
+            "Gazebo in winter",
+            ("gazebo_summer",),
+            20.3,
+            18.9,
+            2.25e6,
+            PaperTrajectory(15, 0.0311, 2.000, 0.0144, 2.90, 2.50),
+        ),
+        "wood_autumn": Sequence(
+            "Wood Autumn",
+            "wood_autumn",
+            (102, 103),
+            "Wood in autumn",
+            ("wood_summer",),
+            13.2,
+            11.5,
+            4.94e6,
+            PaperTrajectory(18, 0.217, 0.205, 0.0178, 0.394, 0.405),
+        ),
+        "wood_summer": Sequence(
+            "Wood Summer",
+            "wood",
+            (100, 101),
+            "Wood in summer",
+            ("wood_autumn",),
+            13.6,
+            11.3,
+            3.52e7,
+            PaperTrajectory(21, 0.332, 0.208, 0.0299, 0.533, 0.762),
+        ),
+    }
+)

@@ -1,0 +1,163 @@
+"""Odometry over two sequences, under compounded covariances that were sampled or predicted."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cello3d_ros.errors import DatasetError
+from cello3d_ros.geometry.gaussian import GaussianPose, to_fixed_axes
+from cello3d_ros.geometry.se3 import Array, inverse
+from cello3d_ros.learning.dataset import Dataset
+from cello3d_ros.learning.online import prepared
+from cello3d_ros.learning.trajectories import Runs, compound_path, odometry_runs
+from cello3d_ros.reproduction import drawing
+from cello3d_ros.reproduction.datasets import Recordings, Workshop, sampled
+from cello3d_ros.reproduction.models import datasets, testable, trained
+from cello3d_ros.reproduction.result import Result
+from cello3d_ros.reproduction.sequences import SEQUENCES
+
+SHOWN = ("wood_summer", "gazebo_winter")  # as in the paper
+_N_RUNS = 20
+_N_SIGMA = 2.0
+_MODELS = {"sampled": "sampled", "paper": "paper's model", "relative": "relative model"}
+
+
+class _Walk(NamedTuple):
+    """truth: (L, 4, 4) in the frame of the first scan.  paths: by model, poses at scans 1..L-1
+    along the truth; runs: 20 odometries.
+    """
+
+    truth: Array
+    paths: dict[str, list[GaussianPose]]
+    runs: Runs
+
+
+def make(workshop: Workshop, training: Recordings, walks: Recordings) -> Result:
+    """Draw 20 runs of each sequence with the ellipses of three covariances."""
+    keys = [key for key in SHOWN if key in testable(training)]
+    if not keys:
+        titles = " and ".join(SEQUENCES[key].title for key in SHOWN)
+        raise DatasetError(f"the figure needs {titles}, one at least, and the other season")
+    needed = {k: training[k] for key in keys for k in SEQUENCES[key].trained_on}
+    found = datasets(workshop, needed)
+    shown = {key: _walk(workshop, found, walks, key) for key in keys}
+    data: dict[str, Any] = {"n_sigma": _N_SIGMA, "sequences": {}}
+    rows: list[list[Any]] = [["sequence", "run", "scan", "x_m", "y_m", "z_m"]]
+    sentences = []
+    for key, walk in shown.items():
+        inside = {name: _share_inside(walk, path[-1]) for name, path in walk.paths.items()}
+        data["sequences"][key] = {
+            "truth": np.round(walk.truth[:, :3, 3], 5).tolist(),
+            "covariances": {
+                name: [_positions(pose).tolist() for pose in path]
+                for name, path in walk.paths.items()
+            },
+            "share_of_finals_inside": inside,
+        }
+        rows += [
+            [key, run, k + 1, *np.round(pose.T[:3, 3], 5).tolist()]
+            for run, path in enumerate(walk.runs.paths)
+            for k, pose in enumerate(path)
+        ]
+        told = ", ".join(f"{share:.0%} ({_MODELS[name]})" for name, share in inside.items())
+        sentences.append(f"{SEQUENCES[key].title}: {told}")
+    text = (
+        f"{_N_RUNS} runs of ICP odometry from above, with ellipses of {_N_SIGMA:g}σ of the "
+        f"compounded covariance at each scan. Black is the truth, green the end. Errors and "
+        f"ellipses are drawn larger by the factor at the axis. Share of final positions within "
+        f"the final ellipse, ideally 86 %: {'; '.join(sentences)}."
+    )
+    title = "Trajectories: sampled against predicted covariances"
+    return Result("fig-trajectories", title, text, data, rows, _figure(shown))
+
+
+def _walk(workshop: Workshop, found: dict[str, Dataset], walks: Recordings, key: str) -> _Walk:
+    models, _ = trained(workshop, found, key, ("paper", "relative"))
+    recording = walks[key][0]
+    chain = sampled(workshop, f"{key}_chain", [recording], max_gap=1)
+    scans = range(len(recording))
+    records = [chain.read(recording.name, k - 1, k) for k in scans[1:]]
+    if bad := [record for record in records if not record.accepted]:
+        raise DatasetError(f"{chain.path}: pair {bad[0].key} was rejected ({bad[0].reason})")
+    clouds, poses = prepared(recording, chain.pipeline, scans, workshop.seed)
+    T = np.array([poses[k] for k in scans])
+    truth = inverse(T[0]) @ T
+    paths = {"sampled": compound_path([GaussianPose(r.T_mean, r.covariance) for r in records])}
+    for name, model in models.items():
+        runs = odometry_runs(
+            [clouds[k] for k in scans], T, model, _N_RUNS, workshop.seed, workshop.n_threads
+        )
+        if not runs.paths:
+            raise DatasetError(f"{recording.name}: no run of odometry has an answer")
+        paths[name] = runs.paths[0]
+    return _Walk(truth, paths, runs)
+
+
+def _positions(pose: GaussianPose) -> Array:
+    """Return the covariance of the position along the axes of the first scan.  (3, 3)."""
+    return to_fixed_axes(pose.T[:3, :3], pose.Y)[:3, :3]
+
+
+def _share_inside(walk: _Walk, last: GaussianPose) -> float:
+    """Return the share of final positions, from above, within the final ellipse."""
+    C = _positions(last)[:2, :2]
+    off = np.array([path[-1].T[:2, 3] for path in walk.runs.paths]) - walk.truth[-1, :2, 3]
+    return float(np.mean(np.einsum("ni,ij,nj->n", off, np.linalg.inv(C), off) <= _N_SIGMA**2))
+
+
+def _figure(shown: dict[str, _Walk]) -> Any:
+    figure = drawing.figure(12.5, 4.6 * len(shown))
+    for row, (key, walk) in enumerate(shown.items()):
+        factor = _factor(walk)
+        first = None
+        for column, (name, path) in enumerate(walk.paths.items()):
+            place = row * len(walk.paths) + column + 1
+            axes = figure.add_subplot(
+                len(shown), len(walk.paths), place, sharex=first, sharey=first
+            )
+            first = first or axes
+            _draw(axes, walk, path, factor)
+            axes.set_title(f"{SEQUENCES[key].title}: {_MODELS[name]}")
+            axes.set_xlabel("x in m")
+            if column == 0:
+                axes.set_ylabel(f"y in m (errors × {factor:g})")
+            if row == column == 0:
+                axes.legend(fontsize=8)
+    return figure
+
+
+def _draw(axes: Any, walk: _Walk, path: list[GaussianPose], factor: float) -> None:
+    truth = walk.truth[:, :2, 3]
+    for n, run in enumerate(walk.runs.paths):
+        xy = np.array([truth[0], *(pose.T[:2, 3] for pose in run)])
+        xy = truth + factor * (xy - truth)
+        label = "odometry" if n == 0 else None
+        axes.plot(*xy.T, color=drawing.BLUE, linewidth=0.6, alpha=0.6, label=label)
+        end = "its end" if n == 0 else None
+        axes.plot(*xy[-1], "o", color=drawing.GREEN, markersize=4, zorder=4, label=end)
+    for k, pose in enumerate(path):
+        last = k == len(path) - 1
+        drawing.ellipse(
+            axes,
+            truth[k + 1],
+            factor**2 * _positions(pose)[:2, :2],
+            _N_SIGMA,
+            color=drawing.GREEN if last else "#999999",
+            linewidth=2.0 if last else 0.8,
+            zorder=3,
+            label=f"{_N_SIGMA:g}σ" if last else None,
+        )
+    axes.plot(*truth.T, color="black", linewidth=3, zorder=2, label="truth")
+    axes.set_aspect("equal")
+    axes.grid(alpha=0.25)
+
+
+def _factor(walk: _Walk) -> float:
+    """Return 1, 2, 5, 10, ...: how much larger errors must be drawn to be seen."""
+    extent = np.ptp(walk.truth[:, :2, 3], axis=0).max()
+    C = _positions(walk.paths["sampled"][-1])[:2, :2]
+    wanted = 0.12 * extent / (_N_SIGMA * np.sqrt(np.linalg.eigvalsh(C)[-1]))
+    steps = [10.0**e * m for e in range(5) for m in (1, 2, 5)]
+    return max([1.0, *(step for step in steps if step <= wanted)])
