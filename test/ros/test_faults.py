@@ -55,7 +55,8 @@ def test_parameters_that_change_under_load(robot, change, ask) -> None:
         ]
         request = SetParameters.Request(parameters=[p.to_parameter_msg() for p in given])
         verdicts.append(client.call_async(request))
-        player.spin_for(0.001)
+        oldest = verdicts[max(0, i - 4)]  # ROS keeps no more than ten requests
+        assert player.spin_until(oldest.done, 20.0)
     assert player.spin_until(lambda: all(v.done() for v in verdicts), 20.0)
     robot.settled()
     player._node.destroy_client(client)
@@ -70,7 +71,7 @@ def test_the_newest_cloud_is_next_when_many_came_during_long_work(robot, change)
     """Each with its odometry, which waits in a queue of its own."""
     player, before = robot.player, robot.walk()
     assert change("node.covariance_mode", "fused").successful
-    assert change("node.n_registrations", 200).successful
+    assert change("node.n_registrations", 60).successful
     clouds, poses = [], []
     for _ in range(30):
         robot.step()
@@ -81,7 +82,7 @@ def test_the_newest_cloud_is_next_when_many_came_during_long_work(robot, change)
         player.clouds.publish(cloud)
         if i == 0:
             player.spin_for(0.1)  # the node is at work on it when the others come
-    after = robot.settled()
+    after = robot.settled(60.0)
     assert after["last_event"] == "answered"
     counts = [int(after[key]) - int(before[key]) for key in ("received", "answered", "dropped")]
     assert counts[0] == 30  # every cloud is accounted for
