@@ -158,6 +158,17 @@ def test_two_nodes_side_by_side(tmp_path, domain_id, model_path) -> None:
         ):
             for robot, process in zip(robots, (left, right)):
                 _connect(robot, process)
+            heard, n_before = players[1].replay, _n_odometry(players[1])
+
+            def both_hear() -> bool:
+                robots[0].stamp_ns += STEP_NS // 100
+                players[0].publish_odometry(robots[0].stamp_ns, robots[0].pose())
+                players[0].spin_for(0.01)
+                return players[0].clouds.get_subscription_count() == 2 and (
+                    int(heard.last_status["odometry_received"]) > n_before
+                )
+
+            assert players[1].spin_until(both_hear, 20.0)
             for _ in range(4):  # both hear the first robot
                 robots[0].walk()
                 robots[1].stamp_ns, robots[1].n = robots[0].stamp_ns, robots[0].n
@@ -172,6 +183,12 @@ def test_two_nodes_side_by_side(tmp_path, domain_id, model_path) -> None:
     finally:
         for player in players:
             player.close()
+
+
+def _n_odometry(player: Player) -> int:
+    """How many odometry messages the node has heard, when it hears no more of them."""
+    player.spin_for(1.5)
+    return int(player.replay.last_status["odometry_received"])
 
 
 def _named(name: str, log, domain_id: int, model_path) -> NodeProcess:
