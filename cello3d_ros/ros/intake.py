@@ -85,6 +85,15 @@ class Intake:
         self._waiting[_N_SLOTS - 1 :] = [job]
         return [_superseded(old) for old in displaced]
 
+    def newest_is_ready(self) -> bool:
+        """Return whether no cloud waits or the newest has all, or can have nothing more."""
+        try:
+            for job in self._waiting[-1:]:
+                self._place(job)
+        except OdometryError as error:
+            return not isinstance(error, OdometryNotYetError)
+        return True
+
     def take(self) -> tuple[Job | None, list[Skip]]:
         """Return the newest cloud whose odometry is there, if any, and what was dropped."""
         skips = []

@@ -14,6 +14,8 @@ What is heard goes to the worker (worker.py), its answers to the outputs (output
 
 from __future__ import annotations
 
+import math
+import time
 import traceback
 from collections.abc import Callable
 from typing import Any
@@ -44,7 +46,7 @@ from cello3d_ros.ros.tracker import Answer, reason_of
 from cello3d_ros.ros.warmup import warm_up
 from cello3d_ros.ros.worker import Worker
 
-_MAX_POSTPONED = 200  # messages heard before work is done all the same
+_PATIENCE_S = 0.05  # longest time for which work is put off to hear what came before it
 _TICK_S = 0.05  # how often it is looked whether a cloud has waited too long
 
 
@@ -97,7 +99,8 @@ class CovarianceNode(ManagedNode):
         self._statistics.listen(True)
         self.active.callback(self._statistics.listen, False)
         self.active.callback(self._worker.stop)
-        self._n_postponed, self._is_news = 0, False
+        self._came: set[Role] = set()
+        self._patient_until_s: float | None = None
         self._cloud_number: int | None = None
         self._work_is_there = self.create_guard_condition(self._work_when_quiet)
         self.active.callback(self.destroy_guard_condition, self._work_is_there)
@@ -145,7 +148,7 @@ class CovarianceNode(ManagedNode):
     # what is heard
 
     def _on_pose(self, message: Odometry | PoseWithCovarianceStamped) -> None:
-        self._is_news = True
+        self._came.add(Role.POSE)
         self._statistics.counts["odometry"] += 1
         if not self._worker.hear_pose(message, self._now_ns()):
             self._statistics.counts["odometry_rejected"] += 1
@@ -164,7 +167,7 @@ class CovarianceNode(ManagedNode):
         self._worker.hear_reference(message)
 
     def _on_cloud(self, message: PointCloud2, info: dict[str, Any]) -> None:
-        self._is_news = True
+        self._came.add(Role.CLOUD)
         self._statistics.receive(self._n_unheard(info))
         self._worker.hear_cloud(message, self._now_ns())
         if self._worker.has_work:
@@ -202,14 +205,17 @@ class CovarianceNode(ManagedNode):
     def _work_when_quiet(self) -> None:
         """Work, but first hear what came meanwhile: an older cloud must not win over the newest.
 
-        A guard runs after the subscriptions, of which each hands over one message at a time.
+        A guard runs after the subscriptions, of which each hands over one message at a time: the
+        newest cloud may be one turn away, and its odometry behind all that came before it.
         """
-        if self._is_news and self._n_postponed < _MAX_POSTPONED:
-            self._is_news = False
-            self._n_postponed += 1
+        came, self._came = self._came, set()
+        is_waited_for = {Role.CLOUD} if self._worker.newest_is_ready else {Role.CLOUD, Role.POSE}
+        now_s = time.monotonic()
+        if came & is_waited_for and now_s < (self._patient_until_s or math.inf):
+            self._patient_until_s = self._patient_until_s or now_s + _PATIENCE_S
             self._work_is_there.trigger()
             return
-        self._n_postponed = 0
+        self._patient_until_s = None
         self._work()
 
     def _work(self) -> None:

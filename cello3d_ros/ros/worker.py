@@ -73,6 +73,11 @@ class Worker:
         """Whether a cloud waits, with or without its odometry."""
         return len(self._intake) > 0
 
+    @property
+    def newest_is_ready(self) -> bool:
+        """Whether the cloud that came last need not wait for its odometry."""
+        return self._intake.newest_is_ready()
+
     def set_config(self, config: Config) -> None:
         """Take the settings that may change while clouds come."""
         self.config = config

@@ -160,3 +160,15 @@ def test_a_missing_external_pose_and_an_unknown_frame_are_counted_apart() -> Non
     intake.offer(job(S))
     (skip,) = intake.expire(0.5)
     assert skip.reason == "unknown_frame"
+
+
+def test_the_newest_is_ready_when_it_has_its_odometry_or_never_will() -> None:
+    buffer = odometry(5 * S)
+    intake = intake_of(buffer)
+    assert intake.newest_is_ready()  # nothing to wait for
+    intake.offer(job(4 * S))
+    assert intake.newest_is_ready()  # older than all odometry
+    intake.offer(job(6 * S))
+    assert not intake.newest_is_ready()
+    buffer.add(6 * S, np.eye(4))
+    assert intake.newest_is_ready()
