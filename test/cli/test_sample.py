@@ -174,7 +174,7 @@ def test_killed_at_random_moments_the_dataset_is_that_of_an_undisturbed_run(tmp_
 
 
 def test_ctrl_c_ends_with_130_and_keeps_what_is_done(tmp_path, recordings):
-    process = started(tmp_path, recordings, tmp_path / "dataset", "--samples", "300")
+    process = started(tmp_path, recordings, tmp_path / "dataset", "--samples", "3000")
     while process.poll() is None and not contents_or_none(tmp_path):
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(0.01)
