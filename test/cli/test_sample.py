@@ -133,7 +133,13 @@ def started(tmp_path, recordings, out, *flags):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        preexec_fn=_hear_interrupts,
     )
+
+
+def _hear_interrupts():
+    """Undo what a shell does to jobs in its background: to ignore SIGINT is inherited."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def files(folder):

@@ -122,6 +122,16 @@ def test_a_publisher_that_is_killed_and_comes_back(robot, node, domain_id) -> No
             other.kill()
             other.wait()
         robot.stamp_ns += 1000 * STEP_NS
+    player = robot.player
+
+    def heard() -> bool:  # best effort: what is sent as the other dies may be lost
+        robot.step()
+        player.publish_odometry(robot.stamp_ns, robot.pose())
+        player.publish_cloud(robot.stamp_ns, robot.points())
+        player.spin_for(0.5)
+        return player.replay.is_settled(robot.stamp_ns)
+
+    assert player.spin_until(heard, 20.0)
     robot.walk(2)
     robot.assert_right_again()
 
@@ -149,6 +159,7 @@ def test_a_node_that_is_killed_and_comes_back(tmp_path, domain_id, model_path) -
 
 def test_two_nodes_side_by_side(tmp_path, domain_id, model_path) -> None:
     names = ["left_node", "right_node"]
+    domain_id += 101  # no other node listens there
     players = [Player(domain_id, f"/{name}") for name in names]
     robots = [Robot(player) for player in players]
     try:
