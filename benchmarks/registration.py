@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
+from cello3d_ros.clouds.leaves import build_leaves, tree_order
 from cello3d_ros.clouds.neighbors import build_tree
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
@@ -26,7 +27,7 @@ from cello3d_ros.geometry.se3 import exp, transform
 from cello3d_ros.registration import icp as kernels
 from cello3d_ros.registration.candidates import Places, make_candidates, nearest
 from cello3d_ros.registration.icp import icp, register_many
-from cello3d_ros.registration.search import build_leaves, search, tree_order
+from cello3d_ros.registration.search import Ranked, search
 
 _CONFIG = IcpConfig()
 
@@ -118,7 +119,7 @@ def profile(read: Any, ref: Any, normals: Any, T: Any, n_runs: int = 50) -> dict
     order = tree_order(ref)
     ref, normals = np.ascontiguousarray(ref[order]), np.ascontiguousarray(normals[order])
     moved = np.ascontiguousarray(transform(T, read[tree_order(read)]))
-    leaves = build_leaves(ref, np.arange(len(ref)))
+    leaves = Ranked(build_leaves(ref), np.arange(len(ref)))
     k = _CONFIG.n_neighbors
     d2, indices = np.empty((len(read), k)), np.full((len(read), k), -1)
     search(moved, leaves, np.inf, d2, indices)

@@ -216,7 +216,7 @@ def leaves_near(
     while top > 0:
         top -= 1
         node = stack[top]
-        mask = _boxes_near_box(boxes, node, x0, y0, z0, x1, y1, z1, far2)
+        mask = boxes_near_box(boxes, node, x0, y0, z0, x1, y1, z1, far2)
         if children[node] >= n_leaves:
             for lane in range(WIDTH - 1, -1, -1):  # the first ends on top
                 if mask >> lane & 1:
@@ -237,7 +237,7 @@ def leaves_near(
 
 
 @njit(cache=True, nogil=True)
-def _boxes_near_box(
+def boxes_near_box(
     boxes: Array,
     node: int,
     x0: float,

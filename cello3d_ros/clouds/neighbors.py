@@ -30,7 +30,7 @@ from cello3d_ros.clouds.leaves import (
 )
 from cello3d_ros.geometry.se3 import Array
 
-__all__ = ["Indices", "KdTree", "any_within", "build_tree", "nearest", "select"]
+__all__ = ["Indices", "KdTree", "any_within", "build_tree", "nearest"]
 
 _FAR2 = 1.7e308  # no finite squared distance is searched for beyond
 _CHUNK = 4096  # queries of one task, a multiple of 16
@@ -180,27 +180,3 @@ def _scan(
                 indices[i, j] = 16 * leaf + lane
             bound2 = min(bound2, distances2[i, k - 1])
     return bool(indices[i, k - 1] >= 0)
-
-
-@njit(cache=True, nogil=True)
-def select(points: Array, order: Indices, lo: int, hi: int, middle: int, axis: int) -> None:
-    """Partition order[lo..hi] so that order[middle] is where sorting by ``axis`` would put it."""
-    while lo < hi:
-        pivot = points[order[(lo + hi) // 2], axis]
-        i = lo
-        j = hi
-        while i <= j:
-            while points[order[i], axis] < pivot:
-                i += 1
-            while points[order[j], axis] > pivot:
-                j -= 1
-            if i <= j:
-                order[i], order[j] = order[j], order[i]
-                i += 1
-                j -= 1
-        if middle <= j:
-            hi = j
-        elif middle >= i:
-            lo = i
-        else:
-            return

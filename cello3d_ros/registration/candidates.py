@@ -34,9 +34,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cello3d_ros.clouds.neighbors import Indices
+from cello3d_ros.clouds.leaves import Indices, lowest_bit
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.registration.lanes import BLOCKS, lowest_bit, nearest_lanes, prefetch
+from cello3d_ros.registration.lanes import BLOCKS, nearest_lanes, prefetch
 
 Integer = int | np.integer[Any]
 

@@ -26,7 +26,7 @@ from numba import njit
 from numba.extending import overload
 
 from cello3d_ros.clouds.filters import subsample
-from cello3d_ros.clouds.neighbors import Indices
+from cello3d_ros.clouds.leaves import Indices, build_leaves, tree_order
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import Array
@@ -37,7 +37,7 @@ from cello3d_ros.registration.candidates import (
     make_room,
     nearest,
 )
-from cello3d_ros.registration.search import Leaves, build_leaves, search, tree_order
+from cello3d_ros.registration.search import Ranked, search
 
 REASONS = ("", "max_iterations", "singular", "too_few_points")
 _SLACK = 1.2  # search beyond the last trim limit, in squared distance
@@ -69,7 +69,7 @@ class _Pair(NamedTuple):
     reading: Array
     reference: Array
     normals: Array
-    near: Leaves | Places
+    near: Ranked | Places
     mean: Array
 
 
@@ -161,8 +161,8 @@ def _icp_in_order(
     centered = reference - mean
     order = tree_order(centered)
     centered = centered[order]
-    leaves = build_leaves(centered, order)
-    return _register_pair(_Pair(reading, centered, normals[order], leaves, mean), T_init, config)
+    near = Ranked(build_leaves(centered), order)
+    return _register_pair(_Pair(reading, centered, normals[order], near, mean), T_init, config)
 
 
 def _too_few(T_init: Array) -> Registration:
@@ -193,10 +193,10 @@ def _register_pair(pair: _Pair, T_init: Array, config: IcpConfig) -> Registratio
 
 
 def _find(
-    moved: Array, index: Leaves | Places, cap2: float, distances2: Array, indices: Indices
+    moved: Array, index: Ranked | Places, cap2: float, distances2: Array, indices: Indices
 ) -> int:
     """Fill the k nearest points at most ``cap2`` away, squared, by one index or the other."""
-    find: Callable[..., int] = search if isinstance(index, Leaves) else nearest
+    find: Callable[..., int] = search if isinstance(index, Ranked) else nearest
     return find(moved, index, cap2, distances2, indices)
 
 
@@ -204,7 +204,7 @@ def _find(
 def _find_compiled(
     moved: Any, index: Any, cap2: Any, distances2: Any, indices: Any
 ) -> Callable[..., int]:
-    find = search if index.instance_class is Leaves else nearest
+    find = search if index.instance_class is Ranked else nearest
     return lambda moved, index, cap2, distances2, indices: find(
         moved, index, cap2, distances2, indices
     )
@@ -215,7 +215,7 @@ def _icp(
     reading: Array,
     reference: Array,
     normals: Array,
-    index: Leaves | Places,
+    index: Ranked | Places,
     T: Array,
     k: int,
     trim_ratio: float,
@@ -265,7 +265,7 @@ def _icp(
 @njit(cache=True, nogil=True)
 def _associate(
     moved: Array,
-    index: Leaves | Places,
+    index: Ranked | Places,
     trim_ratio: float,
     last_limit: float,
     distances2: Array,

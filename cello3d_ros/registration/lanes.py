@@ -29,13 +29,6 @@ _FLOATS, _INTS = ir.VectorType(_F32, _ROW), ir.VectorType(_I32, _ROW)
 _MOST = 0x7FFFFFFF
 
 
-def _lowest_bit(_: Any, __: Any) -> Any:
-    def codegen(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.int64(types.int64), codegen
-
-
 def _prefetch(_: Any, lanes: Any, first: Any, n_blocks: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = _data(context, builder, signature, arguments, 0)
@@ -155,8 +148,6 @@ def _mask_between(builder: Any, all_keys: list[Any], above: Any, most: Any) -> A
     return mask
 
 
-# lowest_bit(mask): the number of the lowest bit that is set
-lowest_bit: Any = intrinsic(_lowest_bit)
 # prefetch(lanes, first, n_blocks): fetch a list into the cache, without waiting for it
 prefetch: Any = intrinsic(_prefetch)
 # nearest_lanes(lanes, first, n_blocks, x, y, z, k, slack, keys): write the k least keys,

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from cello3d_ros.clouds.leaves import build_leaves, tree_order
 from cello3d_ros.registration.candidates import Places, make_candidates, make_room, nearest
 from cello3d_ros.registration.icp import _of_rank
-from cello3d_ros.registration.search import build_leaves, search, tree_order
+from cello3d_ros.registration.search import Ranked, search
 
 _PLANE = np.array([1.0, 1.0, 0.0])
 CASES = {
@@ -44,7 +45,7 @@ def test_the_search_finds_what_sorting_all_distances_finds(case, k):
     rng = np.random.default_rng(21)
     points = CASES[case](rng)
     points = points[tree_order(points)]
-    leaves = build_leaves(points, np.arange(len(points)))
+    leaves = Ranked(build_leaves(points), np.arange(len(points)))
     queries = np.vstack([points[:200], points.mean(axis=0) + 2 * rng.normal(size=(101, 3))])
     queries[7] += 1e7
     distances2, indices = np.full((len(queries), k), np.inf), np.full((len(queries), k), -1)
@@ -62,7 +63,7 @@ def test_of_equally_far_points_the_first_given_wins():
     rng = np.random.default_rng(24)
     given = rng.integers(0, 4, (500, 3)).astype(float)
     order = tree_order(given)
-    leaves = build_leaves(given[order], order)
+    leaves = Ranked(build_leaves(given[order]), order)
     queries = rng.integers(0, 4, (100, 3)) + rng.choice([0.0, 0.5], (100, 3))
     distances2, indices = np.empty((100, 3)), np.full((100, 3), -1)
     search(queries, leaves, np.inf, distances2, indices)
@@ -129,7 +130,7 @@ def test_the_order_is_a_permutation_of_compact_runs(n):
     points = np.random.default_rng(22).normal(size=(n, 3))
     order = tree_order(points)
     assert sorted(order) == list(range(n))
-    leaves = build_leaves(points[order], order)
+    leaves = build_leaves(points[order])
     lanes = leaves.points.transpose(0, 2, 1).reshape(-1, 3)
     np.testing.assert_array_equal(lanes[:n], points[order])
     assert np.isinf(lanes[n:]).all()
