@@ -53,13 +53,12 @@ def estimate(
     method: str = "model",
     settings: MethodSettings = DEFAULTS,
     registration: Registration | None = None,
-    n_threads: int = 1,
 ) -> Estimate:
     """Register two clouds and find the covariance of the result.
 
     T_init: (4, 4), the first guess of T_ref_read.  method: a name of ``METHODS``.  registration:
     the result of whoever registered the clouds (``registered_elsewhere``); ICP is then not run
-    and T_init not looked at.  n_threads changes no result.  A registration that reached its last
+    and T_init not looked at.  A registration that reached its last
     iteration is returned with ``converged`` False: its covariance says little.  Raises
     RegistrationError when ICP or the method has no answer, NoOverlapError when the clouds share
     too little and ModelError when the model looks at the descriptor and the grid is not the
@@ -72,7 +71,7 @@ def estimate(
     if registration.reason not in ("", "max_iterations"):
         raise RegistrationError(f"ICP has no answer: {registration.reason.replace('_', ' ')}")
     T_ref_read = registration.T_ref_read
-    description = describe(reading, reference, T_ref_read, pipeline, n_threads=n_threads)
+    description = describe(reading, reference, T_ref_read, pipeline, n_threads=settings.n_threads)
     pair = Pair(reading, reference, registration, description)
     prediction = predicted(pair, model)
     if method == "model":

@@ -24,6 +24,7 @@ def registrations(
     sampling: SamplingConfig,
     n: int,
     rng: np.random.Generator,
+    n_threads: int = 1,
 ) -> Array:
     """Return xi about T_hat of n registrations that ended where T_hat is.  (at most n, 6).
 
@@ -31,7 +32,7 @@ def registrations(
     errors of this one: kept is what steps of at most one clustering radius connect to T_hat.
     """
     starts = rng.normal(scale=np.sqrt(sampling.variance), size=(n, 6))
-    xi = registered_from(reading, reference, T_hat, starts, pipeline, rng)
+    xi = registered_from(reading, reference, T_hat, starts, pipeline, rng, n_threads)
     return xi[connected(xi, sampling.cluster_scale_m, sampling.cluster_scale_rad)]
 
 

@@ -29,16 +29,17 @@ def sigma_points(
     prior: Array,
     sigma_m: float,
     rng: np.random.Generator,
+    n_threads: int = 1,
 ) -> Array:
     """Return ``1/12 sum xi xi^T + sigma^2 (2 H^-1 + 2 b b^T)``.  (6, 6), reading side.
 
     xi = log(T_hat^-1 T_i), T_i the result of ICP started from ``T_hat exp(offset_i)``; overlap:
     the associations at T_hat; prior: (6, 6), covariance of the starts; H^-1 and b as in
     ``closed_form`` and ``common_bias``; starts without an answer are left out.  12 runs of ICP,
-    each with subsamples of its own.
+    each with subsamples of its own; n_threads changes no result.
     Source: Brossard, Bonnabel, Barrau 2020.
     """
-    xi = registered_from(reading, reference, T_hat, offsets(prior), pipeline, rng)
+    xi = registered_from(reading, reference, T_hat, offsets(prior), pipeline, rng, n_threads)
     if len(xi) == 0:
         raise RegistrationError("ICP has no answer from any sigma point")
     return symmetrized(
@@ -68,12 +69,15 @@ def registered_from(
     starts: Array,
     pipeline: Pipeline,
     rng: np.random.Generator,
+    n_threads: int = 1,
 ) -> Array:
     """Run ICP from ``T_hat exp(start)`` for each start (n, 6), with subsamples drawn anew.
 
     Returns ``log(T_hat^-1 T)`` of those with an answer.  (at most n, 6).
     """
     seeds = rng.integers(2**32, size=(len(starts), 4)).tolist()
-    results = register_many(reading, reference, T_hat @ exp(starts), seeds, pipeline.icp)
+    results = register_many(
+        reading, reference, T_hat @ exp(starts), seeds, pipeline.icp, n_threads
+    )
     answers = [r.T_ref_read for r in results if r.reason in ("", "max_iterations")]
     return log(inverse(T_hat) @ np.array(answers).reshape(-1, 4, 4))

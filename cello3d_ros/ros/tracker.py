@@ -186,7 +186,6 @@ class Tracker:
             method=METHOD_OF[self.config.covariance_mode],
             settings=self._settings(),
             registration=None if external is None else external.registration,
-            n_threads=_N_THREADS,
         )
         if external is not None:
             offset = external.offset
@@ -267,6 +266,7 @@ class Tracker:
             rho_limit=self._rho_limit,
             widen_unknown=config.inflate_unknown,
             scale=config.scale,
+            n_threads=_N_THREADS,
         )
 
     def _fail(self, frame: Frame) -> None:

@@ -81,6 +81,8 @@ def test_registrations_scatter_about_the_reported_one(pair):
     assert 8 <= len(xi) <= 10
     assert 0.0 < np.abs(xi).max() < 0.1
     assert len(np.unique(xi[:, 0])) == len(xi)
+    rng = np.random.default_rng(4)
+    assert (registrations(*pair, T_HAT, Pipeline(), sampling, 10, rng, n_threads=3) == xi).all()
 
 
 def test_every_method_gives_a_covariance_and_repeats_itself(pair):

@@ -37,9 +37,7 @@ def asked(monkeypatch):
     guesses: list[np.ndarray] = []
     instead: list[Exception | bool] = []
 
-    def estimate(
-        reading, reference, T_init, model, pipeline, rng, method, settings, registration, n_threads
-    ):
+    def estimate(reading, reference, T_init, model, pipeline, rng, method, settings, registration):
         guesses.append(T_init)
         fate = instead.pop(0) if instead else True
         if isinstance(fate, Exception):
