@@ -45,6 +45,13 @@ def test_parameters_that_change_under_load(robot, change, ask) -> None:
     change("icp.trim_ratio", 0.7)  # the service is known
     client = player._node.create_client(SetParameters, "/covariance_node/set_parameters")
     assert player.spin_until(client.service_is_ready, 20.0)
+
+    def replied() -> bool:  # the first reply is lost when the node does not know yet who asks
+        future = client.call_async(SetParameters.Request())
+        player.spin_for(0.5)
+        return bool(future.done())
+
+    assert player.spin_until(replied, 20.0)
     for i in range(60):
         robot.step()
         player.publish_odometry(robot.stamp_ns, robot.pose())
