@@ -12,9 +12,9 @@ every operation is monotone, so that a box is never farther than a point in it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from llvmlite import ir
@@ -25,6 +25,9 @@ from numpy.typing import NDArray
 from cello3d_ros.geometry.se3 import Array
 
 Indices = NDArray[np.int64]
+
+P = TypeVar("P")
+T = TypeVar("T")
 
 WIDTH = 16  # children of a node, points of a leaf
 _FAR2 = 1.7e308  # below infinity, so that empty lanes are never near
@@ -43,14 +46,12 @@ class Leaves(NamedTuple):
     children: Indices
 
 
-def in_threads(task: Callable[[Any], Any], parts: list[Any], n_threads: int) -> None:
-    """Run ``task`` on each part, in threads if there are more than one of both."""
+def in_threads(task: Callable[[P], T], parts: Sequence[P], n_threads: int) -> list[T]:
+    """Return what ``task`` makes of each part, in threads if there are more than one of both."""
     if min(n_threads, len(parts)) <= 1:
-        for part in parts:
-            task(part)
-        return
+        return [task(part) for part in parts]
     with ThreadPoolExecutor(min(n_threads, len(parts))) as pool:
-        list(pool.map(task, parts))
+        return list(pool.map(task, parts))
 
 
 def tree_order(points: Array, n_threads: int = 1) -> Indices:

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.filters import subsample
+from cello3d_ros.clouds.leaves import in_threads
 from cello3d_ros.clouds.neighbors import build_tree
 from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import IcpConfig, Pipeline
 from cello3d_ros.errors import CloudError
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings.scanner import Echoes, measure
-from cello3d_ros.registration.backends import in_threads, register
+from cello3d_ros.registration.backends import register
 from cello3d_ros.registration.icp import Registration
 
 
@@ -43,7 +44,7 @@ def register_many_noisy(
         P, Q = noisy(reading, read, sigma_m, rng), noisy(reference, ref, sigma_m, rng)
         return register(P, Q, T_inits[k], config, rng)
 
-    return in_threads(one, len(T_inits), n_threads)
+    return in_threads(one, range(len(T_inits)), n_threads)
 
 
 def register_many_rescanned(
@@ -72,7 +73,7 @@ def register_many_rescanned(
             return Registration(T_inits[k], 0, False, "too_few_points", np.inf, 0)
         return register(P, Q, T_inits[k], pipeline.icp, rng)
 
-    return in_threads(one, len(T_inits), n_threads)
+    return in_threads(one, range(len(T_inits)), n_threads)
 
 
 def noisy(

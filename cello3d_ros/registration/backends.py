@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.filters import subsample
+from cello3d_ros.clouds.leaves import in_threads
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.errors import ConfigError
@@ -28,8 +28,6 @@ from cello3d_ros.registration.icp import Registration
 
 _FEWEST_ASSOCIATIONS = 6  # as many as a rigid motion has degrees of freedom
 _SMALL_GICP_NEIGHBORS = 20  # of the covariance of a point of the subsample
-
-T = TypeVar("T")
 
 
 class Backend(Protocol):
@@ -80,15 +78,7 @@ def register_many(
     def one(k: int) -> Registration:
         return register(reading, reference, T_inits[k], config, np.random.default_rng(seeds[k]))
 
-    return in_threads(one, len(T_inits), n_threads)
-
-
-def in_threads(one: Callable[[int], T], n: int, n_threads: int) -> list[T]:
-    """Return ``[one(0), ..., one(n - 1)]``."""
-    if n_threads <= 1:
-        return [one(k) for k in range(n)]
-    with ThreadPoolExecutor(n_threads) as pool:
-        return list(pool.map(one, range(n)))
+    return in_threads(one, range(len(T_inits)), n_threads)
 
 
 def _open3d(
