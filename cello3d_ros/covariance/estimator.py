@@ -30,7 +30,7 @@ class Estimate(NamedTuple):
     covariance: (6, 6), reading side, ordered (u, omega), by ``method``; nearest_rho: squared
     distance of the model's nearest training example; effective_neighbors: how many examples
     share in the model's answer; novelty: in [0, 1], how far from all of them beside the training
-    pairs (``Prediction``); is_unknown: whether the nearest is beyond the settings' limit.
+    pairs (``Prediction``); is_unknown: whether that is beyond the settings' quantile.
     """
 
     registration: Registration
@@ -86,7 +86,7 @@ def estimate(
         prediction.effective_neighbors,
         method,
         prediction.novelty,
-        prediction.nearest_rho > settings.rho_limit,
+        prediction.novelty > settings.unknown_quantile,
     )
 
 

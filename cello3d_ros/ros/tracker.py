@@ -16,7 +16,6 @@ from cello3d_ros.config import NodeConfig, Pipeline
 from cello3d_ros.covariance.estimator import Estimate, estimate
 from cello3d_ros.covariance.methods import METHODS, MethodSettings
 from cello3d_ros.covariance.model import Model
-from cello3d_ros.covariance.novelty import rho_limit
 from cello3d_ros.errors import CloudError, ModelError, NoOverlapError, RegistrationError
 from cello3d_ros.geometry.gaussian import GaussianPose, compound_right, is_positive_definite
 from cello3d_ros.geometry.se3 import Array, inverse
@@ -77,7 +76,6 @@ class Tracker:
 
     def __init__(self, model: Model, pipeline: Pipeline, config: NodeConfig) -> None:
         self.model, self.pipeline, self.config = model, pipeline, config
-        self._rho_limit = rho_limit(model, config.unknown_quantile)
         self.n_failures = 0  # in a row, against the present reference
         self.n_restarts = 0
         self.last_restart = ""
@@ -278,7 +276,7 @@ class Tracker:
         return MethodSettings(
             sigma_m=config.sensor_sigma_m,
             n_registrations=config.n_registrations,
-            rho_limit=self._rho_limit,
+            unknown_quantile=config.unknown_quantile,
             widen_unknown=config.inflate_unknown,
             scale=config.scale,
             n_threads=_N_THREADS,
