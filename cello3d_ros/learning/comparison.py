@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,12 +42,18 @@ class Predictions:
     cpu_ms: dict[str, Array]
 
 
-def seen_recordings(model: Model) -> set[str]:
-    """Return the recordings that the model was trained or validated on."""
-    seen: set[str] = set()
+def seen_recordings(model: Model, known: Mapping[str, str]) -> dict[str, str]:
+    """Return the recordings that the model was trained or validated on: name -> the model's name.
+
+    known: name -> fingerprint, "" if not known.  One that has the name or the fingerprint of a
+    recording of the model is that recording.
+    """
+    names: set[str] = set()
     for role in ("recordings", "validation_recordings"):
-        seen |= set(model.provenance.get(role, {}))
-    return seen
+        names |= set(model.provenance.get(role, {}))
+    twins = {found: name for name, found in model.provenance.get("fingerprints", {}).items()}
+    seen = {name: name if name in names else twins.get(found) for name, found in known.items()}
+    return {name: twin for name, twin in seen.items() if twin}
 
 
 def training_mean(model: Model) -> Array:

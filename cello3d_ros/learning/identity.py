@@ -19,7 +19,8 @@ def fingerprint(recording: Recording) -> str:
     """Return what tells apart recordings of one name: a hash of the first two scans.
 
     Of each: stamp, points and true pose, to the last bit.  Two are quickly read from any format;
-    what is only different later on is not noticed.
+    what is only different later on is not noticed: crops of one drive that begin at the same
+    scan are one recording, and crops that begin elsewhere are not known to overlap.
     """
     digest = hashlib.sha256()
     for scan in islice(recording, _N_SCANS):
