@@ -117,6 +117,7 @@ def run(arguments: argparse.Namespace) -> None:
     )
     from cello3d_ros.learning.dataset import open_dataset
     from cello3d_ros.learning.examples import load_examples
+    from cello3d_ros.learning.identity import prints_of
 
     if arguments.trajectories and not arguments.recordings:
         raise Cello3dError("trajectories need clouds: name their --recordings")
@@ -129,7 +130,8 @@ def run(arguments: argparse.Namespace) -> None:
     model = load_model(path)
     datasets = [open_dataset(folder) for folder in dict.fromkeys(arguments.datasets)]
     names = chosen(datasets, arguments.only)
-    seen = seen_recordings(model, fingerprints(datasets, names))
+    known = prints_of(datasets, names)
+    seen = seen_recordings(model, {name: known[name] for name in names})
     if seen and not arguments.allow_seen:
         raise DatasetError(
             f"the model was trained or validated on {_named(seen)}: choose others with --only, "
@@ -164,16 +166,6 @@ def chosen(datasets: Sequence[Dataset], only: Sequence[str]) -> list[str]:
     if not names:
         raise DatasetError(f"{datasets[0].path} holds no pair")
     return names
-
-
-def fingerprints(datasets: Sequence[Dataset], names: Sequence[str]) -> dict[str, str]:
-    """Return what tells each recording from others of its name, "" where no folder says it."""
-    found = dict.fromkeys(names, "")
-    for dataset in datasets:
-        for name, facts in dataset.recordings.items():
-            if name in found:
-                found[name] = str(facts.get("fingerprint", "")) or found[name]
-    return found
 
 
 def _named(seen: dict[str, str]) -> str:

@@ -42,18 +42,22 @@ class Predictions:
     cpu_ms: dict[str, Array]
 
 
-def seen_recordings(model: Model, known: Mapping[str, str]) -> dict[str, str]:
+def seen_recordings(model: Model, known: Mapping[str, set[str]]) -> dict[str, str]:
     """Return the recordings that the model was trained or validated on: name -> the model's name.
 
-    known: name -> fingerprint, "" if not known.  One that has the name or the fingerprint of a
-    recording of the model is that recording.
+    known: name -> its prints (``prints_of``).  One that has the name of a recording of the model,
+    or a print, is that recording or a part of it.
     """
     names: set[str] = set()
     for role in ("recordings", "validation_recordings"):
         names |= set(model.provenance.get(role, {}))
-    twins = {found: name for name, found in model.provenance.get("fingerprints", {}).items()}
-    seen = {name: name if name in names else twins.get(found) for name, found in known.items()}
-    return {name: twin for name, twin in seen.items() if twin}
+    prints = model.provenance.get("prints", {})
+    twins = {found: name for name in sorted(prints) for found in prints[name]}
+    seen = {
+        name: [name] if name in names else sorted(twins[p] for p in found if p in twins)
+        for name, found in known.items()
+    }
+    return {name: twin[0] for name, twin in seen.items() if twin}
 
 
 def training_mean(model: Model) -> Array:

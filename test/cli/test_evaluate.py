@@ -184,12 +184,15 @@ def test_a_recording_that_the_model_has_seen_under_another_name_is_refused(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = load_model(folder / "model.npz")
-    prints = {"hall_s0": "one", "hall_s1": "two"}
-    provenance = {**model.provenance, "fingerprints": prints}
+    prints = {"hall_s0": ["one", "1a"], "hall_s1": ["two", "2a", "2b"]}
+    provenance = {**model.provenance, "prints": prints}
     save_model(replace(model, provenance=provenance), folder / "model.npz")
     dataset = open_dataset(folder / "set")
-    for name, found in (("hall_s2", "two"), ("walk", "three")):
-        dataset.add_recording(name, {"n_scans": 3, "fingerprint": found})
+    for name, facts in (
+        ("hall_s2", {"fingerprint": "four", "scans": ["2b", "2c"]}),  # a crop of hall_s1
+        ("walk", {"fingerprint": "three", "scans": ["3a"]}),
+    ):
+        dataset.add_recording(name, facts)
     words = ("--only", "hall_s2", "walk", "--json", folder / "e.json")
     assert evaluate(folder, *words) == 1
     assert "trained or validated on hall_s2 (as hall_s1): choose" in complaint(capsys)
