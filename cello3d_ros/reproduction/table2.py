@@ -83,6 +83,7 @@ def _sequence(workshop: Workshop, recordings: Any, model: Any, n_runs: int) -> d
         np.concatenate([r.xi for r in all_runs]),
         np.concatenate([r.Y for r in all_runs]),
         np.concatenate([r.lost for r in all_runs]),
+        np.concatenate([r.told for r in all_runs]),
         sum(r.n_failed for r in all_runs),
     )
     return {"length_m": float(np.mean(lengths)), **consistency(runs)}

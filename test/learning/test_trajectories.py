@@ -33,7 +33,11 @@ def test_a_chain_of_true_covariances_is_consistent():
     chain = compound_chain([GaussianPose(*step) for step in zip(motions, Y, strict=True)])
     np.testing.assert_allclose(chain.T, truth, atol=1e-12)
     runs = Runs(
-        log(inverse(truth) @ finals), np.tile(chain.Y, (n, 1, 1)), np.zeros(n, np.bool_), 0
+        log(inverse(truth) @ finals),
+        np.tile(chain.Y, (n, 1, 1)),
+        np.zeros(n, np.bool_),
+        np.zeros(n, np.bool_),
+        0,
     )
     report = consistency(runs)
     assert report["dm_6dof"] == pytest.approx(2.350, abs=0.05)
@@ -46,8 +50,9 @@ def test_distances_are_those_of_the_blocks():
     Y = np.tile(np.diag([4.0, 4, 4, 9, 9, 9]), (2, 1, 1))
     Y[:, 0, 3] = Y[:, 3, 0] = 3.0
     xi = np.array([[2.0, 0, 0, 3.0, 0, 0], [0, 40.0, 0, 0, 0, 0]])
-    report = consistency(Runs(xi, Y, np.array([False, True]), 3))
+    report = consistency(Runs(xi, Y, np.array([False, True]), np.array([True, True]), 3))
     assert (report["n_runs"], report["n_failed"], report["n_lost"]) == (2, 3, 1)
+    assert (report["n_told"], report["n_lost_told"]) == (2, 1)
     near = report["without_lost"]
     assert near["dm_translation"] == pytest.approx(1.0)
     assert near["dm_rotation"] == pytest.approx(1.0)
@@ -64,8 +69,10 @@ def test_a_chain_too_wide_for_the_fourth_order_stays_positive_definite():
 
 
 def test_without_any_run_there_are_no_distances():
-    report = consistency(Runs(np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros(0, np.bool_), 4))
-    assert report == {"n_runs": 0, "n_failed": 4, "n_lost": 0, "without_lost": {}}
+    none = np.zeros(0, np.bool_)
+    report = consistency(Runs(np.zeros((0, 6)), np.zeros((0, 6, 6)), none, none, 4))
+    counts = {"n_runs": 0, "n_failed": 4, "n_lost": 0, "n_told": 0, "n_lost_told": 0}
+    assert report == {**counts, "without_lost": {}}
 
 
 def test_length_is_that_of_the_path():
