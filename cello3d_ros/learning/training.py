@@ -48,7 +48,7 @@ _LEVELS = np.linspace(0.0, 1.0, 101)  # of the quantiles that a model keeps
 _PATIENCE = 20  # iterations without a better validation loss that end training
 _DIVERGED = 1e100  # |Theta|^2, far beyond anything and far below where numbers end
 _BATCH = 16  # targets of one stochastic gradient
-_LOST_QUANTILE = 0.95  # of the pairs' sandwiches; decision 11
+_LOST_QUANTILE = 0.97  # of the pairs' sandwiches; decision 11
 _FEWEST_LOST = 30  # registrations in other minima that make a covariance
 
 
@@ -143,7 +143,7 @@ def train(
 def known_lost(examples: Examples) -> Lost | None:
     """Return how to tell registrations in other minima; None where too few were met.
 
-    The limit is what the sandwich of one pair in twenty exceeds where ICP started from the truth.
+    The limit is what the sandwiches of 3 % of the pairs exceed where ICP started from the truth.
     """
     if len(examples.lost_xi) < _FEWEST_LOST or "sandwich" not in examples.shapes:
         return None
