@@ -108,8 +108,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print tables and write the JSON."""
+    from cello3d_ros.config import NodeConfig
     from cello3d_ros.covariance.methods import MethodSettings
     from cello3d_ros.covariance.model import find_model, load_model
+    from cello3d_ros.covariance.novelty import rho_limit
     from cello3d_ros.learning.comparison import from_dataset, mean_of, training_mean
     from cello3d_ros.learning.dataset import open_dataset
     from cello3d_ros.learning.examples import load_examples
@@ -120,9 +122,13 @@ def run(arguments: argparse.Namespace) -> None:
         raise Cello3dError(f"the sensor's noise must be positive: {arguments.sensor_sigma:g}")
     if arguments.json is not None:
         _check_writable(arguments.json)
-    settings = MethodSettings(arguments.sensor_sigma, arguments.registrations)
     path = find_model(arguments.model)
     model = load_model(path)
+    settings = MethodSettings(
+        arguments.sensor_sigma,
+        arguments.registrations,
+        rho_limit(model, NodeConfig().unknown_quantile),
+    )
     datasets = [open_dataset(folder) for folder in dict.fromkeys(arguments.datasets)]
     names = chosen(datasets, arguments.only, model, arguments.allow_seen)
     recordings = _recordings(arguments.recordings, names)
