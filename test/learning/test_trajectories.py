@@ -1,10 +1,13 @@
 """Odometry: chains of known covariances, and ICP between scans of a room."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import CloudConfig, SamplingConfig
+from cello3d_ros.covariance.lost import Lost
 from cello3d_ros.covariance.model import constant_model
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import GaussianPose, is_positive_definite
@@ -133,3 +136,17 @@ def test_lost_and_failed_runs_are_counted(walk, monkeypatch):
     runs = odometry_runs(*walk, a_model(0.01, variance=1e-3), 3)
     assert runs.n_failed == 1
     assert runs.lost.tolist() == [True, False]
+    assert not runs.told.any()
+
+
+def test_runs_are_told_lost_by_the_model_that_knows(walk):
+    V = np.diag([0.8, 0.5, 0.3, 0.1, 0.1, 0.1])
+    model = a_model(0.01, variance=1e-3)
+    runs = odometry_runs(*walk, model, 2, seed=3)
+    for limit_m, is_told in ((1e-9, True), (10.0, False)):
+        knowing = dataclasses.replace(model, lost=Lost(limit_m, V))
+        found = odometry_runs(*walk, knowing, 2, seed=3)
+        np.testing.assert_array_equal(found.xi, runs.xi)
+        assert found.told.tolist() == [is_told] * 2
+        assert not found.lost.any()
+        assert (np.linalg.eigvalsh(found.Y[0] - runs.Y[0])[-1] > 0.7) == is_told
