@@ -41,6 +41,7 @@ _TRAJECTORY = (
     ("runs", "n_runs", "10d"),
     ("failed", "n_failed", "10d"),
     ("lost", "n_lost", "10d"),
+    ("told lost", "n_told", "10d"),
     ("D_M", "dm_6dof", "10.2f"),
     ("transl.", "dm_translation", "10.2f"),
     ("rotation", "dm_rotation", "10.2f"),
@@ -107,6 +108,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print tables and write the JSON."""
+    from cello3d_ros.config import NodeConfig
     from cello3d_ros.covariance.methods import MethodSettings
     from cello3d_ros.covariance.model import find_model, load_model
     from cello3d_ros.learning.comparison import (
@@ -125,9 +127,10 @@ def run(arguments: argparse.Namespace) -> None:
         raise Cello3dError(f"the sensor's noise must be positive: {arguments.sensor_sigma:g}")
     if arguments.json is not None:
         _check_writable(arguments.json)
-    settings = MethodSettings(arguments.sensor_sigma, arguments.registrations)
     path = find_model(arguments.model)
     model = load_model(path)
+    quantile = NodeConfig().unknown_quantile
+    settings = MethodSettings(arguments.sensor_sigma, arguments.registrations, quantile)
     datasets = [open_dataset(folder) for folder in dict.fromkeys(arguments.datasets)]
     names = chosen(datasets, arguments.only)
     known = prints_of(datasets, names)

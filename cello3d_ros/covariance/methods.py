@@ -188,6 +188,7 @@ METHODS: dict[str, Method] = {
     "monte_carlo": by_monte_carlo,
     "fused": by_fusion,
 }
+ASK_MODEL = ("model", "fused")  # methods that answer with the model's prediction
 
 
 def mean_example(model: Model) -> Array:

@@ -40,6 +40,7 @@ _TRAJECTORIES: _Columns = (
     ("runs", "n_runs", "d"),
     ("failed", "n_failed", "d"),
     ("lost", "n_lost", "d"),
+    ("told lost", "n_told", "d"),
     ("D_M (ideal 2.35)", "dm_6dof", ".2f"),
     ("translation (1.60)", "dm_translation", ".2f"),
     ("rotation (1.60)", "dm_rotation", ".2f"),

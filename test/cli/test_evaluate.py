@@ -21,6 +21,7 @@ from cello3d_ros.registration.icp import Registration
 METHODS = {
     "mean_covariance",
     "model",
+    "model_widened",
     "constant",
     "hessian",
     "hessian_scaled",
