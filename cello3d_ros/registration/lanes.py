@@ -153,3 +153,57 @@ prefetch: Any = intrinsic(_prefetch)
 # nearest_lanes(lanes, first, n_blocks, x, y, z, k, slack, keys): write the k least keys,
 # ascending; return a mask of the lanes too close behind the k-th to tell in float32
 nearest_lanes: Any = intrinsic(_nearest_lanes)
+
+
+def _lane_keys(
+    _: Any, lanes: Any, block: Any, x: Any, y: Any, z: Any, row: Any, keys: Any
+) -> Any:
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = _data(context, builder, signature, arguments, 0)
+        out = _data(context, builder, signature, arguments, 6)
+        start = builder.mul(arguments[1], ir.Constant(_I64, 3 * _ROW))
+        d2 = None
+        for axis in range(3):
+            pointer = builder.gep(data, [builder.add(start, ir.Constant(_I64, _ROW * axis))])
+            pointer = builder.bitcast(pointer, _FLOATS.as_pointer())
+            d = builder.fsub(
+                builder.load(pointer, align=4), _splat(builder, arguments[2 + axis], _FLOATS)
+            )
+            d2 = builder.fmul(d, d) if d2 is None else builder.fadd(d2, builder.fmul(d, d))
+        cleared = builder.and_(builder.bitcast(d2, _INTS), ir.Constant(_INTS, [-1024] * _ROW))
+        slot = builder.trunc(builder.shl(arguments[5], ir.Constant(_I64, 4)), _I32)
+        names = builder.or_(_splat(builder, slot, _INTS), ir.Constant(_INTS, list(range(_ROW))))
+        value = builder.or_(cleared, names)
+        first = builder.gep(out, [builder.mul(arguments[5], ir.Constant(_I64, _ROW))])
+        builder.store(value, builder.bitcast(first, _INTS.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    f4, i8 = types.float32, types.int64
+    return types.void(lanes, i8, f4, f4, f4, i8, keys), codegen
+
+
+def _least_key_above(_: Any, keys: Any, n_rows: Any, key: Any) -> Any:
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = _data(context, builder, signature, arguments, 0)
+        floor, most = _splat(builder, arguments[2], _INTS), ir.Constant(_INTS, [_MOST] * _ROW)
+        least = _tools.alloca_once_value(builder, most)
+        builder.store(most, least)
+        with _tools.for_range(builder, arguments[1]) as loop:
+            first = builder.gep(data, [builder.mul(loop.index, ir.Constant(_I64, _ROW))])
+            row = builder.load(builder.bitcast(first, _INTS.as_pointer()), align=4)
+            above = builder.select(builder.icmp_signed(">", row, floor), row, most)
+            before = builder.load(least)
+            builder.store(
+                builder.select(builder.icmp_signed("<", above, before), above, before), least
+            )
+        kind = ir.FunctionType(_I32, [_INTS])
+        reduce = _tools.get_or_insert_function(
+            builder.module, kind, "llvm.vector.reduce.smin.v16i32"
+        )
+        return builder.call(reduce, [builder.load(least)])
+
+    return types.int32(keys, types.int64, types.int32), codegen
+
+
+lane_keys: Any = intrinsic(_lane_keys)
+least_above: Any = intrinsic(_least_key_above)
