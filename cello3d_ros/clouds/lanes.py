@@ -11,11 +11,15 @@ six: the least and the greatest coordinates of its children's boxes.  A mask has
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
+
+_tools: Any = cgutils
 
 _ROW = 16
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
@@ -55,6 +59,34 @@ def _count_row(_: Any, rows: Any, row: Any, most: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         values = _load(builder, _data(context, builder, signature, arguments, 0), arguments[1])
         return builder.ctpop(_mask(builder, values, arguments[2]))
+
+    return _I8(rows, _I8, _F8), codegen
+
+
+def _least_above(_: Any, rows: Any, n_rows: Any, floor: Any) -> Any:
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = _data(context, builder, signature, arguments, 0)
+        floors, nothing = _splat(builder, arguments[2]), ir.Constant(_DOUBLES, [math.inf] * _ROW)
+        least = _tools.alloca_once_value(builder, nothing)
+        with _tools.for_range(builder, arguments[1]) as loop:
+            values, best = _load(builder, data, loop.index), builder.load(least)
+            is_above = builder.fcmp_ordered(">", values, floors)
+            above = builder.select(is_above, values, nothing)
+            is_less = builder.fcmp_ordered("<", above, best)
+            builder.store(builder.select(is_less, above, best), least)
+        kind = ir.FunctionType(ir.DoubleType(), [_DOUBLES])
+        name = "llvm.vector.reduce.fmin.v16f64"
+        reduce = _tools.get_or_insert_function(builder.module, kind, name)
+        return builder.call(reduce, [builder.load(least)], fastmath=("nnan", "nsz"))
+
+    return _F8(rows, _I8, _F8), codegen
+
+
+def _lanes_of(_: Any, rows: Any, row: Any, value: Any) -> Any:
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        values = _load(builder, _data(context, builder, signature, arguments, 0), arguments[1])
+        same = builder.fcmp_ordered("==", values, _splat(builder, arguments[2]))
+        return builder.zext(builder.bitcast(same, ir.IntType(_ROW)), _I64)
 
     return _I8(rows, _I8, _F8), codegen
 
@@ -157,6 +189,10 @@ points_near: Any = intrinsic(_points_near)
 distances_of: Any = intrinsic(_distances_of)
 # count_row(rows, row, most): how many values of a row are at most ``most``
 count_row: Any = intrinsic(_count_row)
+# least_above(rows, n_rows, floor): the least value of n_rows rows that is above floor, not NaN
+least_above: Any = intrinsic(_least_above)
+# lanes_of(rows, row, value): a mask of the lanes of a row that hold the value
+lanes_of: Any = intrinsic(_lanes_of)
 # boxes_near(boxes, node, x, y, z, far2): a mask of the boxes at most far2 from a point, squared
 boxes_near: Any = intrinsic(_boxes_near)
 # boxes_near_box(boxes, node, x0, y0, z0, x1, y1, z1, far2): of those from a box

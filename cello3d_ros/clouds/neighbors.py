@@ -16,7 +16,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cello3d_ros.clouds.lanes import boxes_near, lowest_bit, points_near
+from cello3d_ros.clouds.lanes import (
+    boxes_near,
+    distances_of,
+    lanes_of,
+    least_above,
+    lowest_bit,
+)
 from cello3d_ros.clouds.leaves import (
     WIDTH,
     Indices,
@@ -100,8 +106,10 @@ def _nearest(
     """Fill the neighbours of the queries, closest first.
 
     far2 is the search radius of the sixteen, squared, guess2 that of one: at most far2, less
-    where the neighbours of the query before say so.  Both grow until k are found within.  One
-    function, for slices and calls with arrays cost as much here as the search.
+    where the neighbours of the query before say so.  Both grow until k are found within.  The
+    nearest are then taken from the distances to all candidates one by one, each the least that is
+    left, which vectors find without a branch.  One function, for calls with arrays cost as much
+    here as the search.
     """
     points = leaves.points
     n, k = indices.shape
@@ -109,6 +117,8 @@ def _nearest(
     near = np.empty(len(points), np.int64)
     near_boxes = np.empty((len(points) // 16 + 1, 6, 16))
     stack = np.empty(256, np.int64)
+    candidates = np.empty(len(points), np.int64)  # leaves, and the distances to their points
+    rows = np.empty(16 * len(points))
     box = np.empty(6)
     last2 = most2 = _LEAST2  # the last k-th distance, squared; the greatest of the last sixteen
     for start in range(0, n, WIDTH):
@@ -121,43 +131,41 @@ def _nearest(
             if n_near < 0:
                 n_near = leaves_near(leaves, box, far2, stack, near, near_boxes)
             x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
-            for j in range(k):
-                distances2[i, j] = np.inf
-                indices[i, j] = -1
-            bound2 = guess2
+            n_rows = found = 0
             for block in range((n_near + 15) >> 4):
-                mask = boxes_near(near_boxes, block, x, y, z, bound2)
+                mask = boxes_near(near_boxes, block, x, y, z, guess2)
                 while mask:
                     leaf = near[16 * block + lowest_bit(mask)]
                     mask &= mask - 1
-                    hits = points_near(points, leaf, x, y, z, bound2)
-                    while hits:
-                        lane = lowest_bit(hits)
-                        hits &= hits - 1
-                        dx = points[leaf, 0, lane] - x
-                        dy = points[leaf, 1, lane] - y
-                        dz = points[leaf, 2, lane] - z
-                        d2 = dx * dx + dy * dy + dz * dz
-                        j = k - 1
-                        if d2 >= distances2[i, j]:
-                            continue
-                        while j > 0 and d2 < distances2[i, j - 1]:
-                            distances2[i, j] = distances2[i, j - 1]
-                            indices[i, j] = indices[i, j - 1]
-                            j -= 1
-                        distances2[i, j] = d2
-                        indices[i, j] = 16 * leaf + lane
-                    bound2 = min(bound2, distances2[i, k - 1])
-            if indices[i, k - 1] < 0 and guess2 < far2:
+                    candidates[n_rows] = leaf
+                    found += distances_of(points, leaf, x, y, z, guess2, rows, n_rows)
+                    n_rows += 1
+            if found < k and guess2 < far2:
                 guess2 = min(4.0 * guess2, far2)
                 continue
-            if indices[i, k - 1] < 0 and far2 < max2:
+            if found < k and far2 < max2:
                 far2 = min(growth * far2, max2)
                 growth, guess2, n_near = 2.0 * growth, far2, -1
                 continue
-            last2 = max(bound2, _LEAST2)
+            j, value = 0, -1.0
+            while j < min(found, k):
+                value = least_above(rows, n_rows, value)
+                for first in range(0, n_rows, 4):  # four rows have room in a mask
+                    mask = 0
+                    for row in range(first, min(first + 4, n_rows)):
+                        mask |= lanes_of(rows, row, value) << (16 * (row - first))
+                    while mask and j < k:
+                        lane = lowest_bit(mask)
+                        mask &= mask - 1
+                        distances2[i, j] = value
+                        indices[i, j] = 16 * candidates[first + (lane >> 4)] + (lane & 15)
+                        j += 1
+            last2 = max(value if found >= k else guess2, _LEAST2)
             guess2 = min(1.5 * last2, far2)
             most2 = max(most2, last2)
+            while j < k:
+                distances2[i, j], indices[i, j] = np.inf, -1
+                j += 1
             i += 1
 
 

@@ -50,6 +50,30 @@ def test_each_lane_rounds_as_the_formula_does(seed):
         np.testing.assert_array_equal(rows, [*[-1.0] * 16, *d2, *[-1.0] * 16])
 
 
+@njit
+def in_order(rows, n_rows):
+    """All values of some rows, from the least on, each as often as it is there."""
+    found, value = [0.0][:0], -np.inf
+    while True:
+        value = lanes.least_above(rows, n_rows, value)
+        if value == np.inf:
+            return found
+        for row in range(n_rows):
+            mask = lanes.lanes_of(rows, row, value)
+            while mask:
+                found.append(rows[16 * row + lanes.lowest_bit(mask)])
+                mask &= mask - 1
+
+
+@pytest.mark.parametrize("n_rows", [1, 2, 5])
+def test_the_least_one_after_the_other_are_sorted(n_rows):
+    rng = np.random.default_rng(n_rows)
+    rows = rng.integers(0, 30, 16 * 6).astype(float) - 3.0
+    rows[7:10] = np.inf
+    expected = np.sort(rows[: 16 * n_rows])
+    np.testing.assert_array_equal(in_order(rows, n_rows), expected[np.isfinite(expected)])
+
+
 def test_the_lowest_bit_is_that_of_the_mask():
     lowest = njit(lambda mask: lanes.lowest_bit(mask))
     assert [lowest(mask) for mask in (1, 2, 0b1011000, 1 << 40)] == [0, 1, 3, 40]
