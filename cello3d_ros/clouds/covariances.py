@@ -11,13 +11,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from cello3d_ros.clouds.lanes import boxes_near, count_row, distances_of, lowest_bit
+from cello3d_ros.clouds.lanes import boxes_near, count_row, distances_of, least_above, lowest_bit
 from cello3d_ros.clouds.leaves import WIDTH, Indices, Leaves, leaves_near
 from cello3d_ros.geometry.se3 import Array
 
 _FAR2 = 1.7e308  # no finite squared distance is searched for beyond
 _LEAST2 = 1e-290  # from where a radius grows that was guessed to be nothing
-_FEW = 4  # distances left to choose among by sorting
+_FEW = 4  # distances left to go through one by one
 _TRIES = 12  # thresholds tried before that
 
 
@@ -37,7 +37,6 @@ def covariances(leaves: Leaves, n: int, k: int, first: int, stop: int, out: Arra
     candidates = np.empty(len(points), np.int64)  # leaves, and the distances to their points
     distances2 = np.empty(16 * len(points))
     chosen = np.empty(16 * len(points) + 1, np.int64)
-    scratch = np.empty(16 * len(points) + 1)
     box = np.empty(6)
     guess2 = most2 = _LEAST2  # the last threshold; the greatest of the last leaf
     for g in range(first, stop):
@@ -69,9 +68,7 @@ def covariances(leaves: Leaves, n: int, k: int, first: int, stop: int, out: Arra
                 continue
             threshold2 = bound2
             if found > k:
-                threshold2 = _threshold(
-                    distances2, n_candidates, k, guess2, bound2, found, scratch
-                )
+                threshold2 = _threshold(distances2, n_candidates, k, guess2, bound2, found)
             n_chosen = _choose(distances2, n_candidates, k, threshold2, chosen)
             _covariance(points, candidates, chosen, n_chosen, x, y, z, out, g - first, lane)
             guess2 = max(threshold2, _LEAST2)
@@ -118,18 +115,12 @@ def _count(distances2: Array, n_rows: int, most2: float) -> int:
 
 @njit(cache=True, nogil=True)
 def _threshold(
-    distances2: Array,
-    n_rows: int,
-    k: int,
-    guess2: float,
-    high: float,
-    n_high: int,
-    scratch: Array,
+    distances2: Array, n_rows: int, k: int, guess2: float, high: float, n_high: int
 ) -> float:
     """Return a threshold that k distances do not exceed; more only where they are equal to it.
 
     n_high > k distances are at most ``high``.  Between a threshold with too few and one with too
-    many, the next is interpolated, until one has k or few are left between, to be sorted.
+    many, the next is interpolated, until one has k or few are left between: then one by one.
     """
     low, n_low = 0.0, 0
     middle = guess2 if 0.0 < guess2 < high else high * k / n_high
@@ -145,21 +136,11 @@ def _threshold(
             high, n_high = middle, n_middle
         share = (k - n_low + 0.5) / (n_high - n_low + 1.0)
         middle = low + (high - low) * share
-    if n_low == 0:
-        low = -1.0  # nothing is known of those at 0
-    n = 0
-    for c in range(16 * n_rows):  # scratch has room for one more than there are
-        scratch[n] = distances2[c]
-        n += (distances2[c] > low) & (distances2[c] <= high)
-    if n > 2 * _FEW:
-        return float(np.partition(scratch[:n], k - n_low - 1)[k - n_low - 1])
-    for i in range(k - n_low):
-        least = i
-        for j in range(i + 1, n):
-            if scratch[j] < scratch[least]:
-                least = j
-        scratch[i], scratch[least] = scratch[least], scratch[i]
-    return float(scratch[k - n_low - 1])
+    threshold2 = low if n_low > 0 else -1.0  # nothing is known of those at 0
+    while n_low < k:
+        threshold2 = least_above(distances2, n_rows, threshold2)
+        n_low = _count(distances2, n_rows, threshold2)
+    return threshold2
 
 
 @njit(cache=True, nogil=True)
@@ -184,7 +165,7 @@ def _choose(distances2: Array, n_rows: int, k: int, threshold2: float, chosen: I
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _covariance(
     points: Array,
     candidates: Indices,
