@@ -37,7 +37,7 @@ from cello3d_ros.clouds.leaves import (
     tree_order,
 )
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.registration.lanes import lane_keys, least_above
+from cello3d_ros.registration.lanes import lane_keys, least_key_above
 
 _GROUP = 8  # queries that walk together
 _ROWS = 64  # leaves that are compared at a time, as many as six bits can number
@@ -75,10 +75,11 @@ def search(moved: Array, tree: Tree, cap2: float, distances2: Array, indices: In
     """Fill the k nearest points that are at most ``cap2`` away, squared; return how many.
 
     moved: (M, 3), neighbours in order near in space; distances2, indices: (M, k), closest first,
-    infinite and -1 where there are fewer.  On entry ``indices`` holds the neighbours found by the
-    search before, or -1: k points as good as any, the k-th neighbour cannot be farther than the
-    farthest of them is now.  Eight queries in a row look for their leaves together: a leaf
-    farther from the box around them than the farthest bound of them all concerns none of them.
+    infinite and -1 where there are fewer; indices are those of ``tree.points``.  On entry they
+    hold the neighbours found by the search before, or -1: k points as good as any, the k-th
+    neighbour cannot be farther than the farthest of them is now.  Eight queries in a row look for
+    their leaves together: a leaf farther from the box around them than the farthest bound of them
+    all concerns none of them.  (Functions that take arrays would cost more here than they do.)
     """
     order, points, lanes, scale, boxes, children = tree
     n, k = indices.shape
@@ -100,17 +101,14 @@ def search(moved: Array, tree: Tree, cap2: float, distances2: Array, indices: In
             x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
             x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
             x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
-            bound2 = 0.0
-            if indices[i, k - 1] >= 0:
+            has_bound = indices[i, k - 1] >= 0
+            bound2 = cap2
+            if has_bound or (cap2 == _FAR2 and k <= len(points)):
+                bound2 = 0.0
                 for j in range(k):
-                    p = indices[i, j]
+                    p = indices[i, j] if has_bound else last[j]
                     dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
                     bound2 = max(bound2, dx * dx + dy * dy + dz * dz)
-            elif cap2 == _FAR2 and k <= len(points):
-                for j in range(k):
-                    bound2 = max(bound2, _distance2(points, last[j], x, y, z))
-            else:
-                bound2 = cap2
             bounds2[i - start] = min(bound2, cap2)
             far2 = max(far2, bounds2[i - start])
         n_near, top = 0, 1
@@ -137,17 +135,15 @@ def search(moved: Array, tree: Tree, cap2: float, distances2: Array, indices: In
                 near_boxes[lane >> 4, a, lane & 15] = np.inf
         for i in range(start, stop):
             x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
+            bound2 = bounds2[i - start]
             size = max(abs(x), abs(y), abs(z)) * scale
-            xs, ys, zs = np.float32(x * scale), np.float32(y * scale), np.float32(z * scale)
-            bound2, n_found = bounds2[i - start], 0
-            block = mask = 0
-            for j in range(k):
-                distances2[i, j] = np.inf
-                indices[i, j] = -1
             if not size < _FARTHEST:
-                n_found = _search_all(points, order, x, y, z, distances2, indices, i)
-                block = n_blocks
-            while mask or block < n_blocks:
+                total += _search_all(points, order, x, y, z, cap2, distances2[i], indices[i])
+                continue
+            xs, ys, zs = np.float32(x * scale), np.float32(y * scale), np.float32(z * scale)
+            error2 = 2.0**-31 * (1.0 + size) ** 2
+            n_found = block = mask = 0
+            while mask or block < n_blocks:  # once, but where more than 64 leaves are near
                 n_rows = 0
                 while n_rows < _ROWS and (mask or block < n_blocks):
                     if not mask:
@@ -159,36 +155,39 @@ def search(moved: Array, tree: Tree, cap2: float, distances2: Array, indices: In
                     lane_keys(lanes, leaf, xs, ys, zs, n_rows, keys)
                     rows[n_rows] = leaf
                     n_rows += 1
-                key, most = least_above(keys, n_rows, np.int32(-1)), np.int32(_ABSENT - 1)
+                most = np.int32(_ABSENT - 1)
+                key = least_key_above(keys, n_rows, np.int32(-1))
                 while key <= most:
                     p = 16 * rows[np.int64(key >> 4 & 63)] + np.int64(key & 15)
                     dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
                     d2 = dx * dx + dy * dy + dz * dz
-                    is_better = n_found < k
-                    if not is_better:
-                        other2 = distances2[i, k - 1]
-                        is_better = d2 < other2 or (d2 == other2 and order[p] < order[indices[i, k - 1]])
-                    if is_better:
-                        m = min(n_found, k - 1)
-                        while m > 0 and (d2 < distances2[i, m - 1] or (d2 == distances2[i, m - 1] and order[p] < order[indices[i, m - 1]])):
-                            distances2[i, m], indices[i, m] = distances2[i, m - 1], indices[i, m - 1]
-                            m -= 1
-                        distances2[i, m], indices[i, m] = d2, p
-                        n_found = min(n_found + 1, k)
+                    if n_found == k and not _is_before(
+                        d2, order[p], distances2[i, k - 1], order[indices[i, k - 1]]
+                    ):
+                        key = least_key_above(keys, n_rows, key)
+                        continue
+                    n_found = min(n_found + 1, k)
+                    j = n_found - 1
+                    while j > 0:
+                        other2, other = distances2[i, j - 1], indices[i, j - 1]
+                        if not _is_before(d2, order[p], other2, order[other]):
+                            break
+                        distances2[i, j], indices[i, j] = other2, other
+                        j -= 1
+                    distances2[i, j], indices[i, j] = d2, p
                     if n_found == k:
-                        d2 = distances2[i, k - 1] * scale * scale * (1.0 + 2.0**-11)
-                        d2 += 2.0**-31 * (1.0 + size) ** 2
-                        most = np.int32(np.float32(min(d2, 1e38)).view(np.int32) | 1023)
-                    key = least_above(keys, n_rows, key)
-                bound2 = min(bound2, distances2[i, k - 1])
+                        bound2 = min(bound2, distances2[i, k - 1])
+                        top2 = distances2[i, k - 1] * scale * scale * (1.0 + 2.0**-11) + error2
+                        most = np.int32(np.float32(top2).view(np.int32) | 1023)
+                    key = least_key_above(keys, n_rows, key)
+            if n_found == k:
+                for j in range(k):
+                    last[j] = indices[i, j]
             for j in range(k):
-                is_near = indices[i, j] >= 0 and distances2[i, j] <= cap2
+                is_near = j < n_found and distances2[i, j] <= cap2
                 total += is_near
                 distances2[i, j] = distances2[i, j] if is_near else np.inf
                 indices[i, j] = indices[i, j] if is_near else -1
-            if indices[i, k - 1] >= 0:
-                for j in range(k):
-                    last[j] = indices[i, j]
     return total
 
 
@@ -199,41 +198,30 @@ def _search_all(
     x: float,
     y: float,
     z: float,
+    cap2: float,
     distances2: Array,
     indices: Indices,
-    i: int,
 ) -> int:
-    """Fill the neighbours of query i, looking at all points in double precision."""
+    """Fill the neighbours of one query, looking at all points in double precision."""
     n_found = 0
     for p in range(len(points)):
-        d2 = _distance2(points, p, x, y, z)
-        n_found = _insert(distances2, indices, i, n_found, d2, p, order)
+        d2 = (points[p, 0] - x) ** 2 + (points[p, 1] - y) ** 2 + (points[p, 2] - z) ** 2
+        if not d2 <= cap2:
+            continue
+        j = min(n_found, len(indices) - 1)
+        if n_found == len(indices) and not _is_before(
+            d2, order[p], distances2[j], order[indices[j]]
+        ):
+            continue
+        n_found = min(n_found + 1, len(indices))
+        while j > 0 and _is_before(d2, order[p], distances2[j - 1], order[indices[j - 1]]):
+            distances2[j], indices[j] = distances2[j - 1], indices[j - 1]
+            j -= 1
+        distances2[j], indices[j] = d2, p
+    distances2[n_found:], indices[n_found:] = np.inf, -1
     return n_found
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _distance2(points: Array, p: int, x: float, y: float, z: float) -> float:
-    """Return the squared distance of a point, rounded like those of boxes."""
-    dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
-    return float(dx * dx + dy * dy + dz * dz)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _insert(
-    distances2: Array, indices: Indices, i: int, n_found: int, d2: float, p: int, order: Indices
-) -> int:
-    """Put a point in its place among the neighbours of query i; return how many there are."""
-    k = indices.shape[1]
-    if n_found == k and not _is_before(d2, p, distances2[i, k - 1], indices[i, k - 1], order):
-        return n_found
-    j = min(n_found, k - 1)
-    while j > 0 and _is_before(d2, p, distances2[i, j - 1], indices[i, j - 1], order):
-        distances2[i, j], indices[i, j] = distances2[i, j - 1], indices[i, j - 1]
-        j -= 1
-    distances2[i, j], indices[i, j] = d2, p
-    return min(n_found + 1, k)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _is_before(d2: float, p: int, other2: float, other: int, order: Indices) -> bool:
-    return bool(d2 < other2 or (d2 == other2 and order[p] < order[other]))
+def _is_before(d2: float, rank: int, other2: float, other: int) -> bool:
+    return bool(d2 < other2 or (d2 == other2 and rank < other))
