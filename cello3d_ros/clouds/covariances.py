@@ -11,20 +11,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from cello3d_ros.clouds.leaves import (
-    WIDTH,
-    Indices,
-    Leaves,
-    boxes_near,
-    distances_of,
-    leaves_near,
-    lowest_bit,
-)
+from cello3d_ros.clouds.lanes import boxes_near, count_row, distances_of, least_above, lowest_bit
+from cello3d_ros.clouds.leaves import WIDTH, Indices, Leaves, leaves_near
 from cello3d_ros.geometry.se3 import Array
 
 _FAR2 = 1.7e308  # no finite squared distance is searched for beyond
 _LEAST2 = 1e-290  # from where a radius grows that was guessed to be nothing
-_FEW = 4  # distances left to choose among by sorting
+_FEW = 4  # distances left to go through one by one
 _TRIES = 12  # thresholds tried before that
 
 
@@ -42,10 +35,8 @@ def covariances(leaves: Leaves, n: int, k: int, first: int, stop: int, out: Arra
     near_boxes = np.empty((len(points) // 16 + 1, 6, 16))
     stack = np.empty(256, np.int64)
     candidates = np.empty(len(points), np.int64)  # leaves, and the distances to their points
-    rows = np.empty((len(points), 16))
-    distances2 = rows.ravel()
+    distances2 = np.empty(16 * len(points))
     chosen = np.empty(16 * len(points) + 1, np.int64)
-    scratch = np.empty(16 * len(points) + 1)
     box = np.empty(6)
     guess2 = most2 = _LEAST2  # the last threshold; the greatest of the last leaf
     for g in range(first, stop):
@@ -64,12 +55,12 @@ def covariances(leaves: Leaves, n: int, k: int, first: int, stop: int, out: Arra
             x, y, z = points[g, 0, lane], points[g, 1, lane], points[g, 2, lane]
             bound2 = min(1.3 * guess2, far2)
             n_candidates, found = _candidates(
-                points, near, near_boxes, n_near, x, y, z, bound2, candidates, rows, distances2
+                points, near, near_boxes, n_near, x, y, z, bound2, candidates, distances2
             )
             while found < k and bound2 < far2:
                 bound2 = min(2.0 * bound2, far2)
                 n_candidates, found = _candidates(
-                    points, near, near_boxes, n_near, x, y, z, bound2, candidates, rows, distances2
+                    points, near, near_boxes, n_near, x, y, z, bound2, candidates, distances2
                 )
             if found < k and far2 < _FAR2:
                 far2 = min(growth * far2, _FAR2)
@@ -77,10 +68,8 @@ def covariances(leaves: Leaves, n: int, k: int, first: int, stop: int, out: Arra
                 continue
             threshold2 = bound2
             if found > k:
-                threshold2 = _threshold(
-                    distances2, 16 * n_candidates, k, guess2, bound2, found, scratch
-                )
-            n_chosen = _choose(distances2, 16 * n_candidates, k, threshold2, chosen)
+                threshold2 = _threshold(distances2, n_candidates, k, guess2, bound2, found)
+            n_chosen = _choose(distances2, n_candidates, k, threshold2, chosen)
             _covariance(points, candidates, chosen, n_chosen, x, y, z, out, g - first, lane)
             guess2 = max(threshold2, _LEAST2)
             most2 = max(most2, guess2)
@@ -98,47 +87,47 @@ def _candidates(
     z: float,
     bound2: float,
     candidates: Indices,
-    rows: Array,
     distances2: Array,
 ) -> tuple[int, int]:
     """Fill the leaves at most ``bound2`` away and the distances to their points, squared.
 
     Returns how many leaves, and how many of the points are within the bound.
     """
-    n = 0
+    n = found = 0
     for block in range((n_near + 15) >> 4):
         mask = boxes_near(near_boxes, block, x, y, z, bound2)
         while mask:
-            candidates[n] = near[16 * block + lowest_bit(mask)]
+            leaf = near[16 * block + lowest_bit(mask)]
             mask &= mask - 1
-            distances_of(points, candidates[n], x, y, z, rows, n)
+            candidates[n] = leaf
+            found += distances_of(points, leaf, x, y, z, bound2, distances2, n)
             n += 1
-    return n, _count(distances2, 16 * n, bound2)
+    return n, found
 
 
 @njit(cache=True, nogil=True)
-def _count(distances2: Array, m: int, most2: float) -> int:
+def _count(distances2: Array, n_rows: int, most2: float) -> int:
     n = 0
-    for c in range(m):
-        n += distances2[c] <= most2
+    for row in range(n_rows):
+        n += count_row(distances2, row, most2)
     return n
 
 
 @njit(cache=True, nogil=True)
 def _threshold(
-    distances2: Array, m: int, k: int, guess2: float, high: float, n_high: int, scratch: Array
+    distances2: Array, n_rows: int, k: int, guess2: float, high: float, n_high: int
 ) -> float:
     """Return a threshold that k distances do not exceed; more only where they are equal to it.
 
     n_high > k distances are at most ``high``.  Between a threshold with too few and one with too
-    many, the next is interpolated, until one has k or few are left between, to be sorted.
+    many, the next is interpolated, until one has k or few are left between: then one by one.
     """
     low, n_low = 0.0, 0
     middle = guess2 if 0.0 < guess2 < high else high * k / n_high
     for _ in range(_TRIES):
         if n_high - n_low <= _FEW or not low < middle < high:
             break
-        n_middle = _count(distances2, m, middle)
+        n_middle = _count(distances2, n_rows, middle)
         if n_middle == k:
             return middle
         if n_middle < k:
@@ -147,35 +136,27 @@ def _threshold(
             high, n_high = middle, n_middle
         share = (k - n_low + 0.5) / (n_high - n_low + 1.0)
         middle = low + (high - low) * share
-    if n_low == 0:
-        low = -1.0  # nothing is known of those at 0
-    n = 0
-    for c in range(m):  # scratch has room for one more than there are
-        scratch[n] = distances2[c]
-        n += (distances2[c] > low) & (distances2[c] <= high)
-    if n > 2 * _FEW:
-        return float(np.partition(scratch[:n], k - n_low - 1)[k - n_low - 1])
-    for i in range(k - n_low):
-        least = i
-        for j in range(i + 1, n):
-            if scratch[j] < scratch[least]:
-                least = j
-        scratch[i], scratch[least] = scratch[least], scratch[i]
-    return float(scratch[k - n_low - 1])
+    threshold2 = low if n_low > 0 else -1.0  # nothing is known of those at 0
+    while n_low < k:
+        threshold2 = least_above(distances2, n_rows, threshold2)
+        n_low = _count(distances2, n_rows, threshold2)
+    return threshold2
 
 
 @njit(cache=True, nogil=True)
-def _choose(distances2: Array, m: int, k: int, threshold2: float, chosen: Indices) -> int:
+def _choose(distances2: Array, n_rows: int, k: int, threshold2: float, chosen: Indices) -> int:
     """Fill the first k candidates within the threshold, all below it before any equal to it."""
     n = 0
-    for c in range(m):
+    for c in range(16 * n_rows):
         chosen[n] = c
         n += distances2[c] <= threshold2
     if n <= k:
         return n
-    n_equal = k - _count(distances2, m, np.nextafter(threshold2, -1.0))  # to be taken of the equal
+    n_equal = k - _count(
+        distances2, n_rows, np.nextafter(threshold2, -1.0)
+    )  # to be taken of the equal
     n = 0
-    for c in range(m):
+    for c in range(16 * n_rows):
         chosen[n] = c
         n += distances2[c] < threshold2
         if distances2[c] == threshold2 and n_equal > 0:
@@ -184,7 +165,7 @@ def _choose(distances2: Array, m: int, k: int, threshold2: float, chosen: Indice
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _covariance(
     points: Array,
     candidates: Indices,

@@ -14,14 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 from numpy.typing import NDArray
 
+from cello3d_ros.clouds.lanes import boxes_near as boxes_near
+from cello3d_ros.clouds.lanes import boxes_near_box as boxes_near_box
+from cello3d_ros.clouds.lanes import lowest_bit as lowest_bit
+from cello3d_ros.clouds.lanes import points_near as points_near
 from cello3d_ros.geometry.se3 import Array
 
 Indices = NDArray[np.int64]
@@ -30,7 +32,6 @@ P = TypeVar("P")
 T = TypeVar("T")
 
 WIDTH = 16  # children of a node, points of a leaf
-_FAR2 = 1.7e308  # below infinity, so that empty lanes are never near
 
 
 class Leaves(NamedTuple):
@@ -182,18 +183,6 @@ def build_leaves(points: Array) -> Leaves:
         below, start, size = n_leaves + start, start + size, (size + WIDTH - 1) // WIDTH
 
 
-def _trailing_zeros(_: Any, __: Any) -> Any:
-    """Compile to the one instruction that finds the lowest bit that is set."""
-
-    def codegen(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.int64(types.int64), codegen
-
-
-lowest_bit: Any = intrinsic(_trailing_zeros)
-
-
 @njit(cache=True, nogil=True)
 def leaves_near(
     leaves: Leaves,
@@ -235,71 +224,3 @@ def leaves_near(
         for a in range(6):
             near_boxes[lane >> 4, a, lane & 15] = np.inf
     return n_near
-
-
-@njit(cache=True, nogil=True)
-def boxes_near_box(
-    boxes: Array,
-    node: int,
-    x0: float,
-    y0: float,
-    z0: float,
-    x1: float,
-    y1: float,
-    z1: float,
-    far2: float,
-) -> int:
-    """Return a mask of the node's boxes at most ``far2`` from the box (x0..x1, ...), squared."""
-    block = boxes[node]
-    mask = 0
-    for lane in range(16):
-        dx = max(max(block[0, lane] - x1, x0 - block[3, lane]), 0.0)
-        dy = max(max(block[1, lane] - y1, y0 - block[4, lane]), 0.0)
-        dz = max(max(block[2, lane] - z1, z0 - block[5, lane]), 0.0)
-        if dx * dx + dy * dy + dz * dz <= far2:
-            mask |= 1 << lane
-    return mask
-
-
-@njit(cache=True, nogil=True)
-def boxes_near(boxes: Array, node: int, x: float, y: float, z: float, far2: float) -> int:
-    """Return a mask of the node's boxes at most ``far2`` from a point, squared."""
-    block = boxes[node]
-    mask = 0
-    for lane in range(16):
-        dx = max(max(block[0, lane] - x, x - block[3, lane]), 0.0)
-        dy = max(max(block[1, lane] - y, y - block[4, lane]), 0.0)
-        dz = max(max(block[2, lane] - z, z - block[5, lane]), 0.0)
-        if dx * dx + dy * dy + dz * dz <= far2:
-            mask |= 1 << lane
-    return mask
-
-
-@njit(cache=True, nogil=True)
-def points_near(points: Array, leaf: int, x: float, y: float, z: float, far2: float) -> int:
-    """Return a mask of the leaf's points at most ``far2`` away, squared.
-
-    The limit from below changes no difference: it makes the compiler use vectors.
-    """
-    block = points[leaf]
-    mask = 0
-    for lane in range(16):
-        dx = max(block[0, lane] - x, -_FAR2)
-        dy = max(block[1, lane] - y, -_FAR2)
-        dz = max(block[2, lane] - z, -_FAR2)
-        if dx * dx + dy * dy + dz * dz <= far2:
-            mask |= 1 << lane
-    return mask
-
-
-@njit(cache=True, nogil=True)
-def distances_of(
-    points: Array, leaf: int, x: float, y: float, z: float, rows: Array, row: int
-) -> None:
-    """Fill rows[row], (16,), with the squared distances of the leaf's points, rounded alike."""
-    block, out = points[leaf], rows[row]
-    for lane in range(16):
-        dx = max(block[0, lane] - x, -_FAR2)
-        dy = max(block[1, lane] - y, -_FAR2)
-        dz = max(block[2, lane] - z, -_FAR2)
-        out[lane] = dx * dx + dy * dy + dz * dz

@@ -16,16 +16,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from cello3d_ros.clouds.lanes import (
+    boxes_near,
+    distances_of,
+    lanes_of,
+    least_above,
+    lowest_bit,
+)
 from cello3d_ros.clouds.leaves import (
     WIDTH,
     Indices,
     Leaves,
-    boxes_near,
     build_leaves,
     in_threads,
     leaves_near,
-    lowest_bit,
-    points_near,
     tree_order,
 )
 from cello3d_ros.geometry.se3 import Array
@@ -62,7 +66,7 @@ def build_tree(points: Array, n_threads: int = 1) -> KdTree:
     if len(points) == 0:
         raise ValueError("a k-d tree needs at least one point")
     order = tree_order(points, n_threads)
-    ordered = points[order]
+    ordered = points.take(order, axis=0)  # four times as fast as an index
     return KdTree(ordered, order, *build_leaves(ordered))
 
 
@@ -101,8 +105,11 @@ def _nearest(
 ) -> None:
     """Fill the neighbours of the queries, closest first.
 
-    far2 is the search radius of the sixteen, squared, bound2 that of one: at most far2, less
-    where the neighbours of the query before say so.  Both grow until k are found within.
+    far2 is the search radius of the sixteen, squared, guess2 that of one: at most far2, less
+    where the neighbours of the query before say so.  Both grow until k are found within.  The
+    nearest are then taken from the distances to all candidates one by one, each the least that is
+    left, which vectors find without a branch.  One function, for calls with arrays cost as much
+    here as the search.
     """
     points = leaves.points
     n, k = indices.shape
@@ -110,73 +117,63 @@ def _nearest(
     near = np.empty(len(points), np.int64)
     near_boxes = np.empty((len(points) // 16 + 1, 6, 16))
     stack = np.empty(256, np.int64)
+    candidates = np.empty(len(points), np.int64)  # leaves, and the distances to their points
+    rows = np.empty(16 * len(points))
     box = np.empty(6)
-    guess2 = most2 = _LEAST2  # the last k-th distance, squared; the greatest of the last sixteen
+    last2 = most2 = _LEAST2  # the last k-th distance, squared; the greatest of the last sixteen
     for start in range(0, n, WIDTH):
         stop = min(start + WIDTH, n)
-        for a in range(3):
-            box[a] = queries[start:stop, a].min()
-            box[3 + a] = queries[start:stop, a].max()
+        _box_around(queries, start, stop, box)
         far2 = min(1.5 * most2, max2)
         growth, most2, i, n_near = 2.0, _LEAST2, start, -1
+        guess2 = min(1.5 * last2, far2)
         while i < stop:
             if n_near < 0:
                 n_near = leaves_near(leaves, box, far2, stack, near, near_boxes)
-            bound2 = min(1.5 * guess2, far2)
-            while not _scan(
-                points, near, near_boxes, n_near, queries, i, bound2, distances2, indices
-            ):
-                if bound2 >= far2:
-                    break
-                bound2 = min(4.0 * bound2, far2)
-            if indices[i, k - 1] < 0 and far2 < max2:
+            x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
+            n_rows = found = 0
+            for block in range((n_near + 15) >> 4):
+                mask = boxes_near(near_boxes, block, x, y, z, guess2)
+                while mask:
+                    leaf = near[16 * block + lowest_bit(mask)]
+                    mask &= mask - 1
+                    candidates[n_rows] = leaf
+                    found += distances_of(points, leaf, x, y, z, guess2, rows, n_rows)
+                    n_rows += 1
+            if found < k and guess2 < far2:
+                guess2 = min(4.0 * guess2, far2)
+                continue
+            if found < k and far2 < max2:
                 far2 = min(growth * far2, max2)
                 growth, guess2, n_near = 2.0 * growth, far2, -1
                 continue
-            guess2 = max(min(distances2[i, k - 1], bound2), _LEAST2)
-            most2 = max(most2, guess2)
+            j, value = 0, -1.0
+            while j < min(found, k):
+                value = least_above(rows, n_rows, value)
+                for first in range(0, n_rows, 4):  # four rows have room in a mask
+                    mask = 0
+                    for row in range(first, min(first + 4, n_rows)):
+                        mask |= lanes_of(rows, row, value) << (16 * (row - first))
+                    while mask and j < k:
+                        lane = lowest_bit(mask)
+                        mask &= mask - 1
+                        distances2[i, j] = value
+                        indices[i, j] = 16 * candidates[first + (lane >> 4)] + (lane & 15)
+                        j += 1
+            last2 = max(value if found >= k else guess2, _LEAST2)
+            guess2 = min(1.5 * last2, far2)
+            most2 = max(most2, last2)
+            while j < k:
+                distances2[i, j], indices[i, j] = np.inf, -1
+                j += 1
             i += 1
 
 
 @njit(cache=True, nogil=True)
-def _scan(
-    points: Array,
-    near: Indices,
-    near_boxes: Array,
-    n_near: int,
-    queries: Array,
-    i: int,
-    bound2: float,
-    distances2: Array,
-    indices: Indices,
-) -> bool:
-    """Fill query i's neighbours at most ``bound2`` away, squared; return whether there are k."""
-    k = indices.shape[1]
-    x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
-    for j in range(k):
-        distances2[i, j] = np.inf
-        indices[i, j] = -1
-    for block in range((n_near + 15) >> 4):
-        mask = boxes_near(near_boxes, block, x, y, z, bound2)
-        while mask:
-            leaf = near[16 * block + lowest_bit(mask)]
-            mask &= mask - 1
-            hits = points_near(points, leaf, x, y, z, bound2)
-            while hits:
-                lane = lowest_bit(hits)
-                hits &= hits - 1
-                dx = points[leaf, 0, lane] - x
-                dy = points[leaf, 1, lane] - y
-                dz = points[leaf, 2, lane] - z
-                d2 = dx * dx + dy * dy + dz * dz
-                j = k - 1
-                if d2 >= distances2[i, j]:
-                    continue
-                while j > 0 and d2 < distances2[i, j - 1]:
-                    distances2[i, j] = distances2[i, j - 1]
-                    indices[i, j] = indices[i, j - 1]
-                    j -= 1
-                distances2[i, j] = d2
-                indices[i, j] = 16 * leaf + lane
-            bound2 = min(bound2, distances2[i, k - 1])
-    return bool(indices[i, k - 1] >= 0)
+def _box_around(queries: Array, start: int, stop: int, box: Array) -> None:
+    """Fill box, (6,), with the least and greatest coordinates of queries[start:stop]."""
+    for a in range(3):
+        box[a] = box[3 + a] = queries[start, a]
+        for i in range(start + 1, stop):
+            box[a] = min(box[a], queries[i, a])
+            box[3 + a] = max(box[3 + a], queries[i, a])

@@ -24,7 +24,7 @@ class Cloud(NamedTuple):
 
     points: (N, 3), metres, sensor frame, in the order of the tree, so that neighbours in space
     are near in memory; normals: (N, 3), unit, sign arbitrary; planarity, cylindricality: (N,), in
-    [0, 1]; tree: k-d tree of the points.
+    [0, 1]; these three are empty before ``with_shape``; tree: k-d tree of the points.
     """
 
     points: Array
@@ -42,6 +42,13 @@ def prepare(
     points: (N, 3) finite, sensor frame; the result does not depend on n_threads.  Raises
     CloudError when fewer than ``n_neighbors`` are left after the filters.
     """
+    return with_shape(filtered(points, config, rng, n_threads), config, n_threads)
+
+
+def filtered(
+    points: Array, config: CloudConfig, rng: np.random.Generator, n_threads: int = 1
+) -> Cloud:
+    """Do the first part of ``prepare``: a cloud whose local shape nobody knows yet."""
     cropped = crop_range(points, config.min_range_m, config.max_range_m)
     kept = limit_density(cropped, config.voxel_m, config.max_points_per_voxel, rng)
     if len(kept) < config.n_neighbors:
@@ -51,7 +58,20 @@ def prepare(
         )
     tree = build_tree(kept, n_threads)
     tree = tree._replace(order=np.arange(len(kept)))
-    return Cloud(tree.points, *local_shape(tree, config.n_neighbors, n_threads), tree)
+    return Cloud(tree.points, np.empty((0, 3)), np.empty(0), np.empty(0), tree)
+
+
+def with_shape(cloud: Cloud, config: CloudConfig, n_threads: int = 1) -> Cloud:
+    """Do the second part of ``prepare``, unless it has been done."""
+    if has_shape(cloud):
+        return cloud
+    shape = local_shape(cloud.tree, config.n_neighbors, n_threads)
+    return Cloud(cloud.points, *shape, cloud.tree)
+
+
+def has_shape(cloud: Cloud) -> bool:
+    """Return whether the local shape of a cloud is known."""
+    return len(cloud.normals) == len(cloud.points)
 
 
 def local_shape(tree: KdTree, k: int, n_threads: int = 1) -> tuple[Array, Array, Array]:

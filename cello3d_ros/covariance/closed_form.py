@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.neighbors import Indices
-from cello3d_ros.clouds.shape import Cloud
+from cello3d_ros.clouds.shape import Cloud, has_shape
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import symmetrized
@@ -17,15 +17,20 @@ from cello3d_ros.geometry.se3 import Array, hat, transform
 
 
 class ClosedForm(NamedTuple):
-    """Two cheap predictors, (6, 6), reading side, ordered (u, omega).
+    """Two cheap predictors, (6, 6), reading side, ordered (u, omega), and what they came from.
 
     hessian: ``H^-1``, the covariance for point-to-plane residuals of 1 m deviation;
     sandwich: ``H^-1 (sum_i g_i g_i^T) H^-1``, what redrawing the reading does to the result to
-    first order, g_i being the gradient that one reading point adds.
+    first order, g_i being the gradient that one reading point adds; trim_m: the distance up to
+    which ICP's rules keep associations; residual_rms_m: root mean square of their point-to-plane
+    residuals; n_associations: how many there are.
     """
 
     hessian: Array
     sandwich: Array
+    trim_m: float
+    residual_rms_m: float
+    n_associations: int
 
 
 def closed_form(
@@ -43,7 +48,9 @@ def closed_form(
     n_reading_points of the reading's N points, so both are scaled by N / n_reading_points.
     Raises RegistrationError when the geometry leaves a direction free.
     """
-    H, G = _normal_matrices(
+    assert has_shape(reference)
+    limit2 = _trim_limit(distances2, config)
+    H, G, sum2, n = _normal_matrices(
         reading.points,
         transform(T_ref_read, reading.points),
         reference.points,
@@ -51,11 +58,17 @@ def closed_form(
         np.ascontiguousarray(T_ref_read[:3, :3]),
         distances2,
         indices,
-        _trim_limit(distances2, config),
+        limit2,
     )
     inverse_H = _inverse(H)
     drawn = _drawn(reading, config)
-    return ClosedForm(drawn * inverse_H, symmetrized(drawn * inverse_H @ G @ inverse_H))
+    return ClosedForm(
+        drawn * inverse_H,
+        symmetrized(drawn * inverse_H @ G @ inverse_H),
+        np.sqrt(limit2),
+        np.sqrt(sum2 / n),
+        n,
+    )
 
 
 def censi(
@@ -172,8 +185,10 @@ def _normal_matrices(
     distances2: Array,
     indices: Indices,
     limit: float,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, float, int]:
     """Return H = sum J^T J and G = sum_i g_i g_i^T, g_i = sum J^T r over one point's neighbours.
+
+    The third is sum r^2, the fourth how many associations all of these are sums of.
 
     The residual of ``T exp(xi) p`` has the Jacobian ``[m, p x m]``, m = R^T n: the reading side.
     All of one point's are ``A m`` with the same ``A = [I; hat(p)]``, so that it adds
@@ -181,6 +196,7 @@ def _normal_matrices(
     """
     H, G = np.zeros((6, 6)), np.zeros((6, 6))
     M, B, g = np.empty((3, 3)), np.empty((3, 3)), np.empty(6)
+    sum2, n = 0.0, 0
     for i in range(len(moved)):
         xx = yy = zz = xy = xz = yz = a = b = c = 0.0
         for j in range(indices.shape[1]):
@@ -191,6 +207,8 @@ def _normal_matrices(
             r = (moved[i, 0] - points[q, 0]) * nx
             r += (moved[i, 1] - points[q, 1]) * ny
             r += (moved[i, 2] - points[q, 2]) * nz
+            sum2 += r * r
+            n += 1
             x = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
             y = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
             z = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz
@@ -222,4 +240,4 @@ def _normal_matrices(
     for u in range(6):
         for v in range(u):
             H[v, u], G[v, u] = H[u, v], G[u, v]
-    return H, G
+    return H, G, sum2, n

@@ -9,7 +9,7 @@ import numpy as np
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import Pipeline
 from cello3d_ros.covariance.closed_form import closed_form
-from cello3d_ros.covariance.descriptor import describe_clouds
+from cello3d_ros.covariance.descriptor import describe_clouds, n_features
 from cello3d_ros.covariance.features import global_features
 from cello3d_ros.errors import NoOverlapError
 from cello3d_ros.geometry.se3 import Array, inverse
@@ -44,23 +44,25 @@ def describe(
 ) -> Description:
     """Describe a registered pair.
 
-    T_ref_read: (4, 4); n_threads changes no result.  Raises NoOverlapError when too little
+    T_ref_read: (4, 4); n_rotations: 0 where nobody looks at descriptors, which then are not made;
+    n_threads changes no result.  Raises NoOverlapError when too little
     overlaps and RegistrationError when the geometry leaves a direction free.
     """
     radius_m, k = pipeline.overlap.radius_m, pipeline.icp.n_neighbors
     overlap = find_overlap(reading, reference, T_ref_read, radius_m, k, n_threads)
     _check_overlap(overlap, pipeline)
-    shapes = closed_form(
+    found = closed_form(
         reading, reference, T_ref_read, overlap.distances2, overlap.indices, pipeline.icp
-    )._asdict()
+    )
+    shapes = {"hessian": found.hessian, "sandwich": found.sandwich}
     descriptors = _descriptors(reading, reference, T_ref_read, overlap, pipeline, n_rotations)
-    features = global_features(reading, reference, T_ref_read, overlap, shapes, pipeline.icp)
+    features = global_features(reading, reference, T_ref_read, overlap, found, pipeline.icp)
     return Description(overlap.n_points, overlap.ratio, descriptors, features, shapes, overlap)
 
 
 def turns(n_rotations: int) -> Array:
     """Return the rotations about z by 2 pi k / n_rotations.  (n_rotations, 3, 3)."""
-    angles = 2.0 * np.pi * np.arange(n_rotations) / n_rotations
+    angles = 2.0 * np.pi * np.arange(n_rotations) / max(n_rotations, 1)
     R = np.zeros((n_rotations, 3, 3))
     R[:, 0, 0] = R[:, 1, 1] = np.cos(angles)
     R[:, 1, 0] = np.sin(angles)
@@ -94,6 +96,5 @@ def _descriptors(
     T_read_ref = inverse(T_ref_read)
     turned = np.tile(np.eye(4), (n_rotations, 1, 1))
     turned[:, :3, :3] = turns(n_rotations)
-    return np.array(
-        [describe_clouds(clouds, overlaps, (T, T @ T_read_ref), pipeline.grid) for T in turned]
-    )
+    found = [describe_clouds(clouds, overlaps, (T, T @ T_read_ref), pipeline.grid) for T in turned]
+    return np.array(found).reshape(n_rotations, n_features(pipeline.grid))

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cello3d_ros.clouds.shape import Cloud
+from cello3d_ros.clouds.shape import Cloud, has_shape
 from cello3d_ros.config import GridConfig
 from cello3d_ros.geometry.se3 import Array
 
@@ -62,6 +62,7 @@ def describe_clouds(
     overlaps: (N,) of each cloud; Ts: (4, 4), each takes its cloud to the reading frame, or to a
     turned one.
     """
+    assert all(has_shape(cloud) for cloud in clouds)
     parts = [
         (cloud.points, cloud.normals, cloud.planarity, cloud.cylindricality, overlap)
         for cloud, overlap in zip(clouds, overlaps)

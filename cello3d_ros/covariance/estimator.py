@@ -61,7 +61,8 @@ def estimate(
 ) -> Estimate:
     """Register two clouds and find the covariance of the result.
 
-    T_init: (4, 4), the first guess of T_ref_read.  method: a name of ``METHODS``.  registration:
+    reading: its local shape is looked at only where ``needs_shape`` says so; T_init: (4, 4), the
+    first guess of T_ref_read.  method: a name of ``METHODS``.  registration:
     the result of whoever registered the clouds (``registered_elsewhere``); ICP is then not run
     and T_init not looked at.  A registration that reached its last
     iteration is returned with ``converged`` False: its covariance says little.  Raises
@@ -69,14 +70,17 @@ def estimate(
     too little and ModelError when the model looks at the descriptor and the grid is not the
     model's.
     """
-    if model.features != "global" and pipeline.grid != model.pipeline.grid:
+    if _looks_at_descriptor(model) and pipeline.grid != model.pipeline.grid:
         raise ModelError(f"the model was trained with {model.pipeline.grid}, not {pipeline.grid}")
     if registration is None:
         registration = register(reading, reference, T_init, pipeline.icp, rng)
     if registration.reason not in ("", "max_iterations"):
         raise RegistrationError(f"ICP has no answer: {registration.reason.replace('_', ' ')}")
     T_ref_read = registration.T_ref_read
-    description = describe(reading, reference, T_ref_read, pipeline, n_threads=settings.n_threads)
+    n_rotations = 1 if _looks_at_descriptor(model) else 0
+    description = describe(
+        reading, reference, T_ref_read, pipeline, n_rotations, settings.n_threads
+    )
     pair = Pair(reading, reference, registration, description)
     prediction = predicted(pair, model)
     if method == "model":
@@ -99,6 +103,18 @@ def estimate(
     )
 
 
+def needs_shape(model: Model, pipeline: Pipeline) -> bool:
+    """Return whether ``estimate`` looks at the local shape of the reading, too.
+
+    The descriptor does, and so do other backends than this package's ICP.
+    """
+    return _looks_at_descriptor(model) or pipeline.icp.backend != "icp"
+
+
 def registered_elsewhere(T_ref_read: Array) -> Registration:
     """Return a pose that another program found as a registration of which no more is known."""
     return Registration(np.array(T_ref_read, np.float64, order="C"), 0, True, "", float("nan"), 0)
+
+
+def _looks_at_descriptor(model: Model) -> bool:
+    return model.features != "global"

@@ -7,12 +7,11 @@ when both clouds are turned about the sensor.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from cello3d_ros.clouds.neighbors import Indices
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
-from cello3d_ros.geometry.se3 import Array, transform
+from cello3d_ros.covariance.closed_form import ClosedForm
+from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.overlap import Overlap
 
 #: What ``global_features`` returns, in its order; logarithms are natural.
@@ -40,10 +39,10 @@ def global_features(
     reference: Cloud,
     T_ref_read: Array,
     overlap: Overlap,
-    shapes: dict[str, Array],
+    found: ClosedForm,
     config: IcpConfig,
 ) -> Array:
-    """Return the numbers that ``FEATURES`` names.
+    """Return the numbers that ``FEATURES`` names.  found: of the overlap's associations.
 
     The share of the reading that overlaps; the standard deviation of the sandwich in translation
     and in rotation; the distance up to which ICP keeps associations, their root mean square
@@ -52,8 +51,9 @@ def global_features(
     sandwich against ``rms^2 H^-1``, which independent residuals would make; how many points stand
     behind each that ICP draws, in either cloud; the distance of the two sensors.
     """
-    limit, rms, n = _residuals(reading, reference, T_ref_read, overlap, config)
-    S, H_inverse = shapes["sandwich"], shapes["hessian"]
+    S, H_inverse = found.sandwich, found.hessian
+    # of exact copies nothing is left: 1 um stands for it
+    limit, rms = max(found.trim_m, 1e-6), max(found.residual_rms_m, 1e-6)
     spread = np.sqrt([np.trace(S[:3, :3]), np.trace(S[3:, 3:])])
     traces = np.trace(H_inverse[:3, :3]), np.trace(H_inverse[3:, 3:])
     unit = np.repeat(np.sqrt(3.0 / np.array(traces)), 3)
@@ -66,7 +66,8 @@ def global_features(
         len(reference.points) / min(len(reference.points), config.n_reference_points),
     )
     motion = np.linalg.norm(T_ref_read[:3, 3]) + _MOTION_M
-    logs = np.log([*spread, limit, rms, variances[-1] / variances[0], *against, n, *drawn, motion])
+    condition, n = variances[-1] / variances[0], found.n_associations
+    logs = np.log([*spread, limit, rms, condition, *against, n, *drawn, motion])
     return np.concatenate([[overlap.ratio], logs])
 
 
@@ -81,46 +82,3 @@ def model_inputs(kind: str, descriptors: Array, features: Array) -> Array:
         return descriptors
     row = np.asarray(features)[..., None, :]
     return row if kind == "global" else np.concatenate([row, descriptors[..., :1, :]], axis=-1)
-
-
-def _residuals(
-    reading: Cloud, reference: Cloud, T_ref_read: Array, overlap: Overlap, config: IcpConfig
-) -> tuple[float, float, int]:
-    """Return the trim limit, and rms residual and number of the associations within it."""
-    distances2 = overlap.distances2
-    rank = min(int(distances2.size * config.trim_ratio), distances2.size - 1)
-    limit2 = float(np.partition(distances2, rank, axis=None)[rank])
-    total, n = _sum_residuals(
-        transform(T_ref_read, reading.points),
-        reference.points,
-        reference.normals,
-        distances2,
-        overlap.indices,
-        limit2,
-    )
-    # of exact copies nothing is left: 1 um stands for it
-    return max(np.sqrt(limit2), 1e-6), max(np.sqrt(total / n), 1e-6), n
-
-
-@njit(cache=True, nogil=True)
-def _sum_residuals(
-    moved: Array,
-    points: Array,
-    normals: Array,
-    distances2: Array,
-    indices: Indices,
-    limit2: float,
-) -> tuple[float, int]:
-    """Return the sum of squared point-to-plane residuals within the limit, and their number."""
-    total, n = 0.0, 0
-    for i in range(len(moved)):
-        for j in range(indices.shape[1]):
-            if not distances2[i, j] <= limit2:
-                break
-            q = indices[i, j]
-            r = 0.0
-            for a in range(3):
-                r += (moved[i, a] - points[q, a]) * normals[q, a]
-            total += r * r
-            n += 1
-    return total, n

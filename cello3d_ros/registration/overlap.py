@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.neighbors import Indices, any_within, nearest
@@ -52,10 +53,26 @@ def find_overlap(
     """
     moved = transform(T_ref_read, reading.points)
     distances2, indices = nearest(reference.tree, moved, k, n_threads)
-    within = distances2 <= radius_m**2
+    near = np.zeros(len(reading.points), np.bool_)
     overlaps = np.zeros(len(reference.points), np.bool_)
-    overlaps[indices[within]] = True
+    _mark(distances2, indices, radius_m**2, near, overlaps)
     rest = np.flatnonzero(~overlaps)
-    back = transform(inverse(T_ref_read), reference.points[rest])
+    back = transform(inverse(T_ref_read), reference.points.take(rest, axis=0))
     overlaps[rest] = any_within(reading.tree, back, radius_m, n_threads)
-    return Overlap(within[:, 0], overlaps, distances2, indices)
+    return Overlap(near, overlaps, distances2, indices)
+
+
+@njit(cache=True, nogil=True)
+def _mark(
+    distances2: Array,
+    indices: Indices,
+    radius2: float,
+    reading: NDArray[np.bool_],
+    reference: NDArray[np.bool_],
+) -> None:
+    """Set true where an association is at most the radius long, squared, in either cloud."""
+    for i in range(len(reading)):
+        for j in range(indices.shape[1]):
+            if not distances2[i, j] <= radius2:
+                break  # the others are longer
+            reading[i] = reference[indices[i, j]] = True

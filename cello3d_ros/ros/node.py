@@ -236,6 +236,7 @@ class CovarianceNode(ManagedNode):
             self.get_logger().error(traceback.format_exc())
             self._skip(Skip(job.stamp_ns, "internal", f"{type(error).__name__}: {error}"))
         self._publish_diagnostics()
+        self._worker.finish()
         if self._worker.has_work:
             self._work_is_there.trigger()
 

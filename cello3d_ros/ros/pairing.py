@@ -20,7 +20,7 @@ _SPARE = 10  # of so many times the points that are kept density is made even
 
 @dataclass(frozen=True)
 class Frame:
-    """A prepared scan and where its sensor was.
+    """A filtered scan and where its sensor was; its local shape is found when it is needed.
 
     T_odom_sensor: (4, 4), in the frame of the odometry, as it says or, without it, as the
     registration made of it; None when there has been no odometry since the chain began.

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cello3d_ros.clouds.shape import prepare
+from cello3d_ros.clouds.shape import filtered, with_shape
 from cello3d_ros.config import NodeConfig, Pipeline
-from cello3d_ros.covariance.estimator import Estimate, estimate
+from cello3d_ros.covariance.estimator import Estimate, estimate, needs_shape
 from cello3d_ros.covariance.methods import METHODS, MethodSettings
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import CloudError, ModelError, NoOverlapError, RegistrationError
@@ -118,8 +118,10 @@ class Tracker:
         where nothing has fitted the first scan of a chain and two scans after it fit each other.
         """
         rng = np.random.default_rng([self.config.seed, stamp_ns & (2**64 - 1)])
-        cloud = prepare(points, self.pipeline.cloud, rng, _N_THREADS)
+        cloud = filtered(points, self.pipeline.cloud, rng, _N_THREADS)
         frame = Frame(stamp_ns, cloud, place, place.T_odom_sensor)
+        if needs_shape(self.model, self.pipeline):
+            frame = self._shaped(frame)
         if self._latest is not None:
             frame = self._in_chain(frame, self._latest.frame)
         if self.config.pairing == "topics":
@@ -127,7 +129,9 @@ class Tracker:
         elif self._reference is None:
             self._begin(self._first(frame, _ORIGIN))
             return None
+        self.finish()
         reference = self._reference
+        assert reference is not None
         try:
             answer = self._answer(frame, reference, rng)
         except (RegistrationError, ModelError):
@@ -140,6 +144,17 @@ class Tracker:
             answer, reference = match, rival
         self._accept(frame, answer, reference)
         return self._published(answer, place, reference)
+
+    def finish(self) -> None:
+        """Work ahead: find the local shape of the reference, which the next scan will need.
+
+        An answer need not wait for it; without this call, the next step does it first.
+        """
+        if self._reference is not None:
+            self._reference = replace(self._reference, frame=self._shaped(self._reference.frame))
+
+    def _shaped(self, frame: Frame) -> Frame:
+        return replace(frame, cloud=with_shape(frame.cloud, self.pipeline.cloud, _N_THREADS))
 
     def _in_chain(self, frame: Frame, before: Frame) -> Frame:
         """Return a scan that can follow the one before; else start the chain at it and raise.

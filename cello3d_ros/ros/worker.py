@@ -148,6 +148,10 @@ class Worker:
         assert job.place is not None
         return self._tracker.step(job.stamp_ns, job.points, job.place)
 
+    def finish(self) -> None:
+        """Do what the next cloud would have to wait for, once the last one is answered."""
+        self._tracker.finish()
+
     def expire(self, elapsed_s: float) -> None:
         """Drop the clouds that have waited too long for their odometry."""
         for skip in self._intake.expire(elapsed_s):

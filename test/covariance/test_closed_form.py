@@ -27,7 +27,7 @@ def normal_matrix(points, normals):
     """Return H for points that are associated with themselves."""
     n = len(points)
     zeros, own = np.zeros((n, 1)), np.arange(n)[:, None]
-    H, G = _normal_matrices(points, points, points, normals, np.eye(3), zeros, own, 1.0)
+    H, G, _, _ = _normal_matrices(points, points, points, normals, np.eye(3), zeros, own, 1.0)
     np.testing.assert_array_equal(G, 0.0)  # no residuals
     return H
 

@@ -1,13 +1,15 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from cello3d_ros.clouds.shape import prepare
+from cello3d_ros.clouds.shape import filtered, prepare
 from cello3d_ros.config import GridConfig, IcpConfig, OverlapConfig, Pipeline
 from cello3d_ros.covariance.description import describe, turns
-from cello3d_ros.covariance.estimator import estimate, registered_elsewhere
+from cello3d_ros.covariance.estimator import estimate, needs_shape, registered_elsewhere
 from cello3d_ros.covariance.fused import PRIOR_WEIGHT
 from cello3d_ros.covariance.methods import METHODS, MethodSettings
-from cello3d_ros.covariance.model import Model, constant_model
+from cello3d_ros.covariance.model import Model, constant_model, load_model, shipped_model_path
 from cello3d_ros.errors import ModelError, NoOverlapError, RegistrationError
 from cello3d_ros.geometry.gaussian import is_positive_definite
 from cello3d_ros.geometry.se3 import exp, inverse, log, transform
@@ -160,6 +162,23 @@ def test_another_grid_than_the_models_is_refused(pair):
             other,
             np.random.default_rng(0),
         )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_nobody_looks_at_the_shape_of_the_reading_who_has_not_said_so(pair, room, method):
+    model, icp = load_model(shipped_model_path()), PIPELINE.icp
+    assert not needs_shape(model, PIPELINE)
+    bare = filtered(transform(inverse(T_TRUE), room[0]), PIPELINE.cloud, np.random.default_rng(0))
+    np.testing.assert_array_equal(bare.points, pair[0].points)
+    assert len(bare.normals) == 0
+    one, other = (
+        estimate(cloud, pair[1], T_TRUE, model, PIPELINE, np.random.default_rng(1), method)
+        for cloud in (pair[0], bare)
+    )
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+    np.testing.assert_array_equal(one.registration.T_ref_read, other.registration.T_ref_read)
+    assert needs_shape(constant_model(np.eye(6), 704), PIPELINE)
+    assert needs_shape(model, Pipeline(icp=replace(icp, backend="small_gicp")))
 
 
 def two_examples(pair, far: float):

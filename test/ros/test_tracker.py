@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import Config, NodeConfig
 from cello3d_ros.covariance import estimator
 from cello3d_ros.covariance.estimator import Estimate
-from cello3d_ros.covariance.model import constant_model
+from cello3d_ros.covariance.model import constant_model, load_model, shipped_model_path
 from cello3d_ros.errors import CloudError, NoOverlapError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import compound_right, is_positive_definite
@@ -57,6 +58,7 @@ def tracker() -> Tracker:
 
 
 POINTS = room(np.random.default_rng(0), 500)
+SMALL_STEPS = [se3.exp(np.array([0.3, 0.1, 0.0, 0.0, 0.01, 0.05]) * i) for i in range(5)]
 POSES = [se3.exp(np.array([0.5, 0.1, 0.0, 0.1, 0.2, 0.6]) * i) for i in range(8)]
 
 
@@ -85,6 +87,42 @@ def test_a_long_chain_stays_positive_definite(tracker, asked) -> None:
     for i in range(300):
         answer = tracker.step(i * S, POINTS, Place(POSES[i % 2]))
     assert is_positive_definite(answer.Y_chain)
+
+
+@pytest.mark.parametrize("pairing_name", ["consecutive", "keyframe", "topics"])
+@pytest.mark.parametrize("model", [load_model(shipped_model_path()), constant_model(WIDE, 704)])
+def test_answers_are_the_same_whether_it_is_worked_ahead_or_not(pairing_name, model) -> None:
+    """And the same as those of clouds that were prepared at once."""
+    node = NodeConfig(pairing=pairing_name, keyframe_distance_m=1.0)
+    config = Config(node=node)
+    ahead, late = (Tracker(model, config, node) for _ in range(2))
+    scans = [se3.transform(se3.inverse(T), 2.0 * POINTS) for T in SMALL_STEPS]
+    places = [Place(T, T_map_odom=np.eye(4)) for T in SMALL_STEPS]
+    if pairing_name == "topics":
+        ahead.take_map(0, 2.0 * POINTS, "map")
+        late.take_map(0, 2.0 * POINTS, "map")
+    n_answers = 0
+    for i, (scan, place) in enumerate(zip(scans, places)):
+        one, other = ahead.step(i * S, scan, place), late.step(i * S, scan, place)
+        ahead.finish()
+        assert (one is None) == (other is None)
+        if one is None or other is None:
+            continue
+        n_answers += 1
+        assert one.reference_ns == other.reference_ns
+        for name in ("T_odom_read", "Y_chain"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        np.testing.assert_array_equal(one.estimate.covariance, other.estimate.covariance)
+        if pairing_name == "consecutive":
+            rngs = [np.random.default_rng([node.seed, k * S]) for k in (i, i - 1)]
+            clouds = [prepare(scans[k], config.cloud, rng) for k, rng in zip((i, i - 1), rngs)]
+            T_init = se3.inverse(SMALL_STEPS[i - 1]) @ SMALL_STEPS[i]
+            settings = ahead._settings()
+            expected = estimator.estimate(
+                *clouds, T_init, model, config, rngs[0], settings=settings
+            )
+            np.testing.assert_array_equal(one.estimate.covariance, expected.covariance)
+    assert n_answers >= len(SMALL_STEPS) - 1
 
 
 def test_a_failed_scan_leaves_the_reference_and_the_chain(tracker, asked) -> None:
