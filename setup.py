@@ -40,6 +40,7 @@ setup(
         "numpy>=1.26,<2.5",
         "scipy>=1.11",
         "numba>=0.59",
+        "llvmlite",  # numba says which
         "threadpoolctl>=3.1",
         "PyYAML>=6",
         "tqdm>=4.60",

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
-from cello3d_ros.clouds.leaves import build_leaves, tree_order
+from cello3d_ros.clouds.leaves import tree_order
 from cello3d_ros.clouds.neighbors import build_tree
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
@@ -27,7 +27,8 @@ from cello3d_ros.geometry.se3 import exp, transform
 from cello3d_ros.registration import icp as kernels
 from cello3d_ros.registration.candidates import Places, make_candidates, nearest
 from cello3d_ros.registration.icp import icp, register_many
-from cello3d_ros.registration.search import Ranked, search
+from cello3d_ros.registration.search import build_tree as build_search_tree
+from cello3d_ros.registration.search import search
 
 _CONFIG = IcpConfig()
 
@@ -116,10 +117,9 @@ def timed(work: Callable[[], Any]) -> tuple[float, Any]:
 
 def profile(read: Any, ref: Any, normals: Any, T: Any, n_runs: int = 50) -> dict[str, float]:
     """Time the three parts of an iteration where ICP ends, the neighbours known."""
-    order = tree_order(ref)
-    ref, normals = np.ascontiguousarray(ref[order]), np.ascontiguousarray(normals[order])
     moved = np.ascontiguousarray(transform(T, read[tree_order(read)]))
-    leaves = Ranked(build_leaves(ref), np.arange(len(ref)))
+    leaves = build_search_tree(ref)
+    ref, normals = leaves.points, np.ascontiguousarray(normals[leaves.order])
     k = _CONFIG.n_neighbors
     d2, indices = np.empty((len(read), k)), np.full((len(read), k), -1)
     search(moved, leaves, np.inf, d2, indices)

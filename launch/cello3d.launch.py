@@ -17,6 +17,7 @@ ARGUMENTS = {
     "odom": ("/odom", "topic of the odometry (nav_msgs/Odometry)"),
     "reference_points": ("/reference_points", "topic of a map, when node.pairing is topics"),
     "external_odometry": ("/kiss/odometry", "poses to judge, when node.registration is external"),
+    "external_pose": ("/external_pose", "the same as PoseWithCovarianceStamped"),
     "model": ("", "model file; empty is the shipped one"),
     "params": ("", "parameter file of the node; empty is the model's settings and the defaults"),
     "covariance_mode": ("", "cello3d, fused, ...; empty is that of the parameter file"),
@@ -28,7 +29,7 @@ ARGUMENTS = {
     "bag": ("", "rosbag2 folder to play; empty plays none"),
     "bag_delay_s": ("8.0", "wait before the bag, so that the node is ready"),
 }
-TOPICS = ("points", "odom", "reference_points", "external_odometry")
+TOPICS = ("points", "odom", "reference_points", "external_odometry", "external_pose")
 
 
 def actions(context):

@@ -1,7 +1,22 @@
-"""Importing needs neither ROS nor Open3D, and does nothing else."""
+"""Importing needs neither ROS nor Open3D, does nothing else, and all that it needs is declared."""
 
+import ast
+import re
 import subprocess
 import sys
+import xml.etree.ElementTree
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+OF_PIP = {"yaml": "PyYAML", "open3d": "open3d-cpu"}  # distributions not called as their module
+#: Modules without a rosdep key of their name: it, or that of a package that brings them.
+OF_ROSDEP = {
+    "open3d": "python3-open3d-pip",
+    "rosbags": "python3-rosbags-pip",
+    "threadpoolctl": "python3-sklearn",
+    "llvmlite": "python3-numba",
+}
+NO_KEY = {"pyarrow", "plotly", "small_gicp", "distributed"}  # and needed by few verbs only
 
 SCRIPT = """
 import importlib, pkgutil, sys
@@ -20,3 +35,47 @@ def test_all_but_the_node_imports_without_ros_and_open3d(tmp_path):
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert list(tmp_path.iterdir()) == []
+
+
+def imported(folder: str) -> set[str]:
+    """Modules of others that are imported in a folder, at the top of a file or late."""
+    names: set[str] = set()
+    for path in (ROOT / folder).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                names.add(str(node.module))
+    tops = {name.split(".")[0] for name in names}
+    return tops - sys.stdlib_module_names - {"cello3d_ros"}
+
+
+def is_of_ros(name: str) -> bool:
+    return name in ("rclpy", "std_srvs") or name.endswith(("_msgs", "_interfaces"))
+
+
+def keys_of_package_xml() -> set[str]:
+    tree = xml.etree.ElementTree.parse(ROOT / "package.xml")
+    return {str(e.text) for e in tree.iter() if e.tag == "exec_depend"}
+
+
+def test_what_is_imported_has_its_key_in_package_xml():
+    keys = keys_of_package_xml()
+    for name in imported("cello3d_ros") | imported("launch"):
+        known = {name, f"python3-{name}", OF_ROSDEP.get(name)}
+        assert known & keys or name in NO_KEY, f"{name} is not in package.xml"
+
+
+def test_what_is_imported_has_its_requirement_in_setup_py():
+    text = (ROOT / "setup.py").read_text()
+    for name in imported("cello3d_ros"):
+        if not is_of_ros(name):  # of the extra ros, as a whole
+            assert re.search(rf'"{OF_PIP.get(name, name)}\b', text), f"{name} is not in setup.py"
+
+
+def test_package_xml_names_nothing_that_is_not_imported():
+    used = imported("cello3d_ros") | imported("launch")
+    names = {"python3-yaml": "yaml"} | {key: name for name, key in OF_ROSDEP.items()}
+    for key in keys_of_package_xml() - {"lifecycle_msgs"}:  # which rclpy.lifecycle imports
+        name = names.get(key, key.removeprefix("python3-"))
+        assert name in used, f"{key} is in package.xml but not imported"

@@ -82,6 +82,7 @@ def as_dict(estimate: Estimate) -> dict[str, Any]:
         "method": estimate.method,
         "nearest_rho": estimate.nearest_rho,
         "novelty": estimate.novelty,
+        "probably_lost": estimate.is_lost,
         "effective_neighbours": estimate.effective_neighbors,
     }
 
@@ -90,6 +91,8 @@ def _as_text(answer: dict[str, Any]) -> str:
     T = np.reshape(answer["T_ref_read"], (4, 4))
     sigmas = np.sqrt(np.diag(np.reshape(answer["covariance"], (6, 6))))
     state = "converged" if answer["converged"] else "did NOT converge: do not rely on this"
+    if answer["probably_lost"]:
+        state += ", but probably to a WRONG pose, in another minimum,"
     return "\n".join(
         [
             "T_ref_read",

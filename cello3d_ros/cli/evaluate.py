@@ -41,6 +41,7 @@ _TRAJECTORY = (
     ("runs", "n_runs", "10d"),
     ("failed", "n_failed", "10d"),
     ("lost", "n_lost", "10d"),
+    ("told lost", "n_told", "10d"),
     ("D_M", "dm_6dof", "10.2f"),
     ("transl.", "dm_translation", "10.2f"),
     ("rotation", "dm_rotation", "10.2f"),
@@ -107,11 +108,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print tables and write the JSON."""
+    from cello3d_ros.config import NodeConfig
     from cello3d_ros.covariance.methods import MethodSettings
     from cello3d_ros.covariance.model import find_model, load_model
-    from cello3d_ros.learning.comparison import from_dataset, mean_of, training_mean
+    from cello3d_ros.learning.comparison import (
+        from_dataset,
+        mean_of,
+        seen_recordings,
+        training_mean,
+    )
     from cello3d_ros.learning.dataset import open_dataset
     from cello3d_ros.learning.examples import load_examples
+    from cello3d_ros.learning.identity import prints_of
 
     if arguments.trajectories and not arguments.recordings:
         raise Cello3dError("trajectories need clouds: name their --recordings")
@@ -119,11 +127,19 @@ def run(arguments: argparse.Namespace) -> None:
         raise Cello3dError(f"the sensor's noise must be positive: {arguments.sensor_sigma:g}")
     if arguments.json is not None:
         _check_writable(arguments.json)
-    settings = MethodSettings(arguments.sensor_sigma, arguments.registrations)
     path = find_model(arguments.model)
     model = load_model(path)
+    quantile = NodeConfig().unknown_quantile
+    settings = MethodSettings(arguments.sensor_sigma, arguments.registrations, quantile)
     datasets = [open_dataset(folder) for folder in dict.fromkeys(arguments.datasets)]
-    names = chosen(datasets, arguments.only, model, arguments.allow_seen)
+    names = chosen(datasets, arguments.only)
+    known = prints_of(datasets, names)
+    seen = seen_recordings(model, {name: known[name] for name in names})
+    if seen and not arguments.allow_seen:
+        raise DatasetError(
+            f"the model was trained or validated on {_named(seen)}: choose others with --only, "
+            "or say --allow-seen"
+        )
     recordings = _recordings(arguments.recordings, names)
     baseline = [open_dataset(folder) for folder in arguments.baseline]
     mean = mean_of(baseline) if baseline else training_mean(model)
@@ -134,6 +150,8 @@ def run(arguments: argparse.Namespace) -> None:
     assumed = {name: getattr(settings, name) for name in ("sigma_m", "n_registrations")}
     report: dict[str, Any] = {"model": str(path), "shape": model.shape, "settings": assumed}
     report |= _pairs_report(predictions, examples, keys, settings, arguments.exact_poses)
+    for name, part in report["recordings"].items():
+        part["trained_on"] = name in seen
     report["worst_pairs"] = _worst_pairs(datasets, report["pairs"], keys, predictions)
     report["trajectories"] = _trajectories(recordings, model, arguments)
     print("\n".join(_tables(report)))
@@ -141,16 +159,8 @@ def run(arguments: argparse.Namespace) -> None:
         write_json(arguments.json, report)
 
 
-def chosen(
-    datasets: Sequence[Dataset], only: Sequence[str], model: Model, allow_seen: bool
-) -> list[str]:
-    """Return the recordings to evaluate.
-
-    Raises DatasetError for a pattern that matches nothing and, unless allowed, for recordings
-    that the model has seen.
-    """
-    from cello3d_ros.learning.comparison import seen_recordings
-
+def chosen(datasets: Sequence[Dataset], only: Sequence[str]) -> list[str]:
+    """Return the recordings to evaluate.  Raises DatasetError for a pattern that matches none."""
     names = sorted({key[0] for dataset in datasets for key in dataset.pair_keys()})
     for pattern in only:
         if not any(fnmatch.fnmatchcase(name, pattern) for name in names):
@@ -158,12 +168,12 @@ def chosen(
     names = [name for name in names if not only or _matches(name, only)]
     if not names:
         raise DatasetError(f"{datasets[0].path} holds no pair")
-    if not allow_seen and (seen := sorted(set(names) & seen_recordings(model))):
-        raise DatasetError(
-            f"the model was trained or validated on {', '.join(seen)}: choose others with --only, "
-            "or say --allow-seen"
-        )
     return names
+
+
+def _named(seen: dict[str, str]) -> str:
+    """Return recordings that a model has seen, with its own name where that is another."""
+    return ", ".join(n if n == twin else f"{n} (as {twin})" for n, twin in sorted(seen.items()))
 
 
 def write_json(path: Path, report: dict[str, Any]) -> None:
@@ -361,6 +371,8 @@ def _tables(report: dict[str, Any]) -> Iterator[str]:
             yield f"  {name}: left out of the figures, suspected of wrong poses: {pairs}"
     for name, part in report["recordings"].items():
         yield from _table(f"{name} ({part['n_pairs']} pairs)", _COLUMNS, part["methods"])
+        if part["trained_on"]:
+            yield f"  {name}: the model was trained or validated on it, which flatters the model"
     yield from _table(f"all ({report['n_pairs']} pairs)", _COLUMNS, report["methods"])
     if "with_flagged_pairs" in report:
         part = report["with_flagged_pairs"]

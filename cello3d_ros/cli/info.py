@@ -103,6 +103,7 @@ def _describe_model(path: Path, _: argparse.Namespace) -> dict[str, Any]:
         "cutoff_rho": model.cutoff_rho if np.isfinite(model.cutoff_rho) else None,
         "prior_variance": model.sampling.variance,
         **_mean_sigmas(model),
+        **_lost(model),
         "provenance": model.provenance,
         "pipeline": {name: config[name] for name in PIPELINE},
         "sampling": _settings(model.sampling),
@@ -115,6 +116,18 @@ def _mean_sigmas(model: Model) -> dict[str, Any]:
     if model.shape != "none":
         return {"mean_sigmas_relative": sigmas}
     return {"mean_sigmas_m": sigmas[:3], "mean_sigmas_rad": sigmas[3:]}
+
+
+def _lost(model: Model) -> dict[str, Any]:
+    """Return beyond which sandwich a registration is lost, and how far such ones scatter."""
+    if model.lost is None:
+        return {"lost": None}
+    sigmas = [float(value) for value in np.sqrt(np.diag(model.lost.covariance))]
+    return {
+        "lost_beyond_sandwich_m": model.lost.limit_m,
+        "lost_sigmas_m": sigmas[:3],
+        "lost_sigmas_rad": sigmas[3:],
+    }
 
 
 def _settings(section: Any) -> dict[str, Any]:

@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> None:
     from threadpoolctl import threadpool_limits
 
     from cello3d_ros.learning.dataset import open_dataset
-    from cello3d_ros.learning.identity import fingerprint
+    from cello3d_ros.learning.identity import fingerprint, scan_prints
     from cello3d_ros.recordings import open_recording
     from cello3d_ros.recordings.rescan import rescannable
     from cello3d_ros.recordings.simulation import Simulation
@@ -87,7 +87,12 @@ def run(arguments: argparse.Namespace) -> None:
     with _progress() as bar, _sampler(arguments, pipeline, sampling, paths, bar) as sampler:
         dataset = open_dataset(arguments.out, pipeline, sampling, create=True)
         for recording in recordings:
-            facts = {"n_scans": len(recording), "fingerprint": fingerprint(recording)}
+            bar.set_description(f"reading {recording.name}")
+            facts: dict[str, Any] = {"n_scans": len(recording)}
+            facts["fingerprint"] = fingerprint(recording)
+            known = dataset.recordings.get(recording.name, {})
+            if scans := known.get("scans") or scan_prints(recording):
+                facts["scans"] = scans
             if sampling.noise_m > 0.0:
                 facts["noise"] = "rescans" if isinstance(recording, Simulation) else "added"
             dataset.add_recording(recording.name, facts)

@@ -88,7 +88,9 @@ def run(arguments: argparse.Namespace) -> None:
     examples = load_examples(datasets, split.training)
     validation = load_examples(datasets, split.validation) if split.validation else None
     training = train(examples, config, validation, _report if sys.stderr.isatty() else None)
-    save_model(training.model, arguments.out)
+    prints = {name: sorted(known[name]) for name in (*split.training, *split.validation)}
+    provenance = {**training.model.provenance, "prints": prints}
+    save_model(replace(training.model, provenance=provenance), arguments.out)
     judged_by = "validation recordings" if validation else "training, regularised"
     picture = arguments.out.with_suffix(".learning_curve.png")
     plot_learning_curve(training.curve, training.best_iteration, judged_by, picture)

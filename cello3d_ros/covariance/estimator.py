@@ -9,7 +9,9 @@ import numpy as np
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import Pipeline
 from cello3d_ros.covariance.description import describe
+from cello3d_ros.covariance.lost import covering, is_lost
 from cello3d_ros.covariance.methods import (
+    ASK_MODEL,
     DEFAULTS,
     METHODS,
     MethodSettings,
@@ -30,7 +32,9 @@ class Estimate(NamedTuple):
     covariance: (6, 6), reading side, ordered (u, omega), by ``method``; nearest_rho: squared
     distance of the model's nearest training example; effective_neighbors: how many examples
     share in the model's answer; novelty: in [0, 1], how far from all of them beside the training
-    pairs (``Prediction``); is_unknown: whether the nearest is beyond the settings' limit.
+    pairs (``Prediction``); is_unknown: whether that is beyond the settings' quantile; is_lost:
+    whether ICP probably ended in another minimum.  Then methods that ask the model give the
+    scatter of such registrations (``covering``).
     """
 
     registration: Registration
@@ -41,6 +45,7 @@ class Estimate(NamedTuple):
     method: str = "model"
     novelty: float = 0.0
     is_unknown: bool = False
+    is_lost: bool = False
 
 
 def estimate(
@@ -82,6 +87,9 @@ def estimate(
         Y = widened(prediction, pair, pipeline, model, rng, settings)
     else:
         Y = METHODS[method](pair, pipeline, model, rng, settings)
+    lost = is_lost(description.shapes["sandwich"], model.lost)
+    if model.lost is not None and lost and method in ASK_MODEL:
+        Y = covering(Y, model.lost)
     return Estimate(
         registration,
         description.overlap_ratio,
@@ -90,7 +98,8 @@ def estimate(
         prediction.effective_neighbors,
         method,
         prediction.novelty,
-        prediction.nearest_rho > settings.rho_limit,
+        prediction.novelty > settings.unknown_quantile,
+        lost,
     )
 
 

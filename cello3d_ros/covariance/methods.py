@@ -7,7 +7,6 @@ definite covariance of its registration, reading side, ordered (u, omega).  The 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -40,14 +39,15 @@ class MethodSettings(NamedTuple):
     """What methods assume and what is made of their answers.
 
     sigma_m: deviation of the sensor's noise along each axis; n_registrations: extra runs of ICP
-    by ``monte_carlo`` and ``fused``; rho_limit: the ``nearest_rho`` beyond which a pair is unlike
-    all examples; widen_unknown: whether the model's prediction is then widened to their mean;
+    by ``monte_carlo`` and ``fused``; unknown_quantile: the ``novelty`` beyond which a pair is
+    unlike all examples; widen_unknown: whether the model's prediction is then widened to their
+    mean;
     scale: what ``estimate`` multiplies every covariance by; n_threads changes no result.
     """
 
     sigma_m: float = 0.01
     n_registrations: int = 12
-    rho_limit: float = math.inf
+    unknown_quantile: float = 1.0
     widen_unknown: bool = False
     scale: float = 1.0
     n_threads: int = 1
@@ -140,6 +140,7 @@ def by_sigma_points(
     return sigma_points(
         *(pair.reading, pair.reference, pair.registration.T_ref_read),
         pair.description.overlap,
+        pair.description.shapes["hessian"],
         pipeline,
         prior,
         settings.sigma_m,
@@ -187,6 +188,7 @@ METHODS: dict[str, Method] = {
     "monte_carlo": by_monte_carlo,
     "fused": by_fusion,
 }
+ASK_MODEL = ("model", "fused")  # methods that answer with the model's prediction
 
 
 def mean_example(model: Model) -> Array:
@@ -219,7 +221,7 @@ def widened(
 
     That is the larger of it and the mean of the examples (``by_constant``).
     """
-    if not settings.widen_unknown or prediction.nearest_rho <= settings.rho_limit:
+    if not settings.widen_unknown or prediction.novelty <= settings.unknown_quantile:
         return prediction.covariance
     prior = by_constant(pair, pipeline, model, rng, settings)
     return larger(prior, prediction.covariance)

@@ -32,6 +32,7 @@ from cello3d_ros.config import (
 )
 from cello3d_ros.covariance.archive import read_arrays, write_arrays
 from cello3d_ros.covariance.features import KINDS
+from cello3d_ros.covariance.lost import Lost
 from cello3d_ros.covariance.sums import squared_distances, weighted_sum
 from cello3d_ros.errors import ConfigError, ModelError
 from cello3d_ros.geometry.gaussian import is_positive_definite, matrix_sqrt, symmetrized
@@ -70,6 +71,7 @@ class Model:
     rho_quantiles, neighbors_quantiles: (Q,) or empty, evenly spaced quantiles of the nearest rho
     and of the effective neighbours of the training pairs, each seen from other recordings.
     cutoff_rho: examples with ``rho - min(rho)`` beyond this weigh nothing; inf is no cut-off.
+    lost: how to tell a registration that ended in another minimum; None where nothing is known.
     provenance: recordings, seeds, versions, settings, figures; anything that JSON can hold.
     Raises ModelError naming what does not fit.  The arrays are read-only.
     """
@@ -86,6 +88,7 @@ class Model:
     mean_weight: float = 0.0
     margin: float = 1.0
     cutoff_rho: float = math.inf
+    lost: Lost | None = None
     pipeline: Pipeline = field(default_factory=Pipeline)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -98,6 +101,8 @@ class Model:
         _check_settings(self)
         for name in ("mean_weight", "margin", "cutoff_rho"):
             object.__setattr__(self, name, _number(name, getattr(self, name)))
+        if self.lost is not None:
+            object.__setattr__(self, "lost", _checked(self.lost))
         for start in range(0, len(self.covariances), _BLOCK):
             fine = is_positive_definite(self.covariances[start : start + _BLOCK])
             if not fine.all():
@@ -229,6 +234,7 @@ def load_model(path: Path | str) -> Model:
             mean_weight=header["mean_weight"],
             margin=header["margin"],
             cutoff_rho=math.inf if cutoff is None else cutoff,
+            lost=_lost_from(header.get("lost")),
             pipeline=pipeline_of(config),
             sampling=config.sampling,
             provenance=header["provenance"],
@@ -262,8 +268,22 @@ def _header(model: Model) -> dict[str, Any]:
         "mean_weight": model.mean_weight,
         "margin": model.margin,
         "cutoff_rho": None if math.isinf(model.cutoff_rho) else model.cutoff_rho,
+        "lost": None if model.lost is None else _lost_to(model.lost),
         "provenance": model.provenance,
     }
+
+
+def _lost_to(lost: Lost) -> dict[str, Any]:
+    return {"limit_m": lost.limit_m, "covariance": lost.covariance.tolist()}
+
+
+def _lost_from(item: object) -> Lost | None:
+    """Return what the header holds; models made before decision 11 hold nothing."""
+    if item is None:
+        return None
+    if not isinstance(item, dict) or set(item) != {"limit_m", "covariance"}:
+        raise ModelError(f"item 'lost' is not a limit_m and a covariance: {item!r}")
+    return Lost(**item)
 
 
 def _read_header(path: Path | str) -> dict[str, Any]:
@@ -290,7 +310,7 @@ def _read_header(path: Path | str) -> dict[str, Any]:
 def _check_items(found: Mapping[str, Any], wanted: Mapping[str, Any], where: str) -> None:
     """Raise ModelError for a missing item; settings within a section may be missing."""
     for name in wanted:
-        if name not in found:
+        if name not in found and name != "lost":
             raise ModelError(f"{where}: item {name!r} is missing")
     if not isinstance(found["config"], dict):
         raise ModelError(f"{where}: item 'config' holds no sections")
@@ -384,6 +404,16 @@ def _check_settings(model: Model) -> None:
         raise ModelError(f"margin must be positive and finite: {model.margin!r}")
     if not _number("cutoff_rho", model.cutoff_rho) >= 0.0:
         raise ModelError(f"cutoff_rho must not be negative: {model.cutoff_rho!r}")
+
+
+def _checked(lost: Lost) -> Lost:
+    """Return an own, read-only copy of what is known of other minima, or raise ModelError."""
+    limit_m, covariance = _number("lost.limit_m", lost.limit_m), _frozen("lost", lost.covariance)
+    if not 0.0 < limit_m < math.inf:
+        raise ModelError(f"lost.limit_m must be positive and finite: {limit_m!r}")
+    if covariance.shape != (6, 6) or not is_positive_definite(covariance):
+        raise ModelError("lost.covariance is not a positive definite 6x6 matrix")
+    return Lost(limit_m, covariance)
 
 
 def _number(name: str, value: object) -> float:

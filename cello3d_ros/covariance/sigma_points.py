@@ -6,7 +6,7 @@ import numpy as np
 
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import Pipeline
-from cello3d_ros.covariance.closed_form import closed_form, common_bias
+from cello3d_ros.covariance.closed_form import common_bias
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import symmetrized
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log
@@ -25,6 +25,7 @@ def sigma_points(
     reference: Cloud,
     T_hat: Array,
     overlap: Overlap,
+    inverse_H: Array,
     pipeline: Pipeline,
     prior: Array,
     sigma_m: float,
@@ -34,17 +35,16 @@ def sigma_points(
     """Return ``1/12 sum xi xi^T + sigma^2 (2 H^-1 + 2 b b^T)``.  (6, 6), reading side.
 
     xi = log(T_hat^-1 T_i), T_i the result of ICP started from ``T_hat exp(offset_i)``; overlap:
-    the associations at T_hat; prior: (6, 6), covariance of the starts; H^-1 and b as in
-    ``closed_form`` and ``common_bias``; starts without an answer are left out.  12 runs of ICP,
-    each with subsamples of its own; n_threads changes no result.
+    the associations at T_hat; inverse_H: (6, 6), H^-1 as in ``closed_form``; prior: (6, 6),
+    covariance of the starts; b as in ``common_bias``; starts without an answer are left out.  12
+    runs of ICP, each with subsamples of its own; n_threads changes no result.
     Source: Brossard, Bonnabel, Barrau 2020.
     """
     xi = registered_from(reading, reference, T_hat, offsets(prior), pipeline, rng, n_threads)
     if len(xi) == 0:
         raise RegistrationError("ICP has no answer from any sigma point")
-    return symmetrized(
-        xi.T @ xi / len(xi) + sensor_term(reading, reference, T_hat, overlap, pipeline, sigma_m)
-    )
+    added = sensor_term(reading, reference, T_hat, overlap, inverse_H, pipeline, sigma_m)
+    return symmetrized(xi.T @ xi / len(xi) + added)
 
 
 def sensor_term(
@@ -52,13 +52,13 @@ def sensor_term(
     reference: Cloud,
     T_hat: Array,
     overlap: Overlap,
+    inverse_H: Array,
     pipeline: Pipeline,
     sigma_m: float,
 ) -> Array:
     """Return ``sigma^2 (2 H^-1 + 2 b b^T)``: independent noise and a common bias, two clouds."""
     found = (overlap.distances2, overlap.indices, pipeline.icp)
     b = common_bias(reading, reference, T_hat, *found)
-    inverse_H = closed_form(reading, reference, T_hat, *found).hessian
     return np.asarray(2.0 * sigma_m**2 * (inverse_H + np.outer(b, b)))
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _FEWEST_IN_CORE = 2  # a sample alone is no cluster
+_FAR = 3.0  # clustering scales from the truth beyond which a registration is in another minimum
 
 
 def nearest_cluster(
@@ -50,6 +51,17 @@ def offset(xi: Array) -> tuple[float, float]:
     """
     mean = np.mean(xi, axis=0)
     return float(np.linalg.norm(mean[:3])), float(np.linalg.norm(mean[3:]))
+
+
+def far_from_truth(xi: Array, scale_m: float, scale_rad: float) -> NDArray[np.bool_]:
+    """Return which registrations ended in another minimum: more than 3 scales from the truth.
+
+    xi: (..., 6).  Returns (...).  Unlike ``nearest_cluster`` it needs no other registrations.
+    """
+    return np.asarray(
+        (np.linalg.norm(xi[..., :3], axis=-1) > _FAR * scale_m)
+        | (np.linalg.norm(xi[..., 3:], axis=-1) > _FAR * scale_rad)
+    )
 
 
 @njit(cache=True, nogil=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from cello3d_ros.config import differences
 from cello3d_ros.covariance.methods import METHODS, MethodSettings, extra_runs, mean_example
 from cello3d_ros.covariance.model import Model, predict
 from cello3d_ros.errors import DatasetError
-from cello3d_ros.geometry.gaussian import kl
+from cello3d_ros.geometry.gaussian import kl, larger
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import Dataset
 from cello3d_ros.learning.evaluation import best_scale, figures, select
@@ -42,12 +42,22 @@ class Predictions:
     cpu_ms: dict[str, Array]
 
 
-def seen_recordings(model: Model) -> set[str]:
-    """Return the recordings that the model was trained or validated on."""
-    seen: set[str] = set()
+def seen_recordings(model: Model, known: Mapping[str, set[str]]) -> dict[str, str]:
+    """Return the recordings that the model was trained or validated on: name -> the model's name.
+
+    known: name -> its prints (``prints_of``).  One that has the name of a recording of the model,
+    or a print, is that recording or a part of it.
+    """
+    names: set[str] = set()
     for role in ("recordings", "validation_recordings"):
-        seen |= set(model.provenance.get(role, {}))
-    return seen
+        names |= set(model.provenance.get(role, {}))
+    prints = model.provenance.get("prints", {})
+    twins = {found: name for name in sorted(prints) for found in prints[name]}
+    seen = {
+        name: [name] if name in names else sorted(twins[p] for p in found if p in twins)
+        for name, found in known.items()
+    }
+    return {name: twin[0] for name, twin in seen.items() if twin}
 
 
 def training_mean(model: Model) -> Array:
@@ -78,8 +88,10 @@ def from_dataset(
 ) -> Predictions:
     """Return what the methods that need no clouds say.
 
-    mean: (6, 6), the baseline.  Raises DatasetError where the dataset's settings are not the
-    model's: its descriptors would not be comparable.
+    mean: (6, 6), the baseline.  ``model_widened`` is what the node makes of the model's answer by
+    default: the larger of it and the mean of the examples beyond ``settings.unknown_quantile``.
+    Raises DatasetError where the dataset's settings are not the model's: its descriptors would not
+    be comparable.
     """
     found = differences(examples.pipeline, model.pipeline)
     if model.features == "global":
@@ -94,14 +106,20 @@ def from_dataset(
     S: Sequence[Array | None] = [None] * n
     if model.shape != "none":
         S = list(examples.shapes[model.shape])
-    F = [
-        predict(model, d[row], S_k).covariance for d, S_k in zip(examples.features, S, strict=True)
-    ]
-    constant = np.tile(mean_example(model), (n, 1, 1))
+    answers = [predict(model, d[row], S_k) for d, S_k in zip(examples.features, S, strict=True)]
+    constant = to_absolute(np.tile(mean_example(model), (n, 1, 1)), examples, model.shape)
     covariances = {
         BASELINE: np.tile(mean, (n, 1, 1)),
-        "model": np.array(F),
-        "constant": to_absolute(constant, examples, model.shape),
+        "model": np.array([answer.covariance for answer in answers]),
+        "model_widened": np.array(
+            [
+                larger(prior, answer.covariance)
+                if answer.novelty > settings.unknown_quantile
+                else answer.covariance
+                for answer, prior in zip(answers, constant, strict=True)
+            ]
+        ),
+        "constant": constant,
     }
     if "hessian" in examples.shapes:
         covariances["hessian"] = settings.sigma_m**2 * examples.shapes["hessian"]

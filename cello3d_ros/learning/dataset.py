@@ -35,7 +35,7 @@ CONVENTIONS = (
     "T_ref_read maps reading points into the reference frame; xi = (u, omega) = "
     "log(inverse(T_mean) T_hat); covariances about ground truth, on the reading side"
 )
-_PACKAGES = ("cello3d_ros", "numpy", "scipy", "numba", "scikit-learn")
+_PACKAGES = ("cello3d_ros", "numpy", "scipy", "numba")
 _ARRAYS = {
     "T_mean": "<f8",
     "xi": "<f8",

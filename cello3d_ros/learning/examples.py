@@ -16,6 +16,7 @@ from cello3d_ros.covariance.features import model_inputs
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.geometry.gaussian import matrix_inverse_sqrt, matrix_sqrt, symmetrized
 from cello3d_ros.geometry.se3 import Array, adjoint, exp
+from cello3d_ros.learning.clustering import far_from_truth
 from cello3d_ros.learning.dataset import Dataset, PairRecord
 
 Indices = NDArray[np.intp]
@@ -32,7 +33,8 @@ class Examples:
     features: (N, n_rotations, D) descriptors of the pair turned about z by ``rotations_rad``;
     after ``select_inputs`` what a model looks at.  global_features: (N, G).
     covariances: (N, 6, 6).  groups: (N,) names of recordings.  shapes: name -> (N, 6, 6).
-    xi: N arrays (n, 6), some of the errors that made each covariance.
+    xi: N arrays (n, 6), some of the errors that made each covariance.  lost_xi: (M, 6), the errors
+    of all their registrations that ended in another minimum.
     """
 
     features: NDArray[np.floating[Any]]
@@ -42,6 +44,7 @@ class Examples:
     rotations_rad: Array
     global_features: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
     xi: tuple[Array, ...] = ()
+    lost_xi: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 6)))
     rejected: dict[str, int] = dataclasses.field(default_factory=dict)  # reason -> pairs
     pipeline: Pipeline = dataclasses.field(default_factory=Pipeline)
     sampling: SamplingConfig = dataclasses.field(default_factory=SamplingConfig)
@@ -62,13 +65,17 @@ def load_examples(datasets: Sequence[Dataset], recordings: Iterable[str]) -> Exa
         _check_alike(datasets[0], other)
     wanted = set(recordings)
     records: dict[tuple[str, int, int], PairRecord] = {}
+    lost: dict[tuple[str, int, int], Array] = {}
     for dataset in datasets:
         for key in dataset.pair_keys():
             if key[0] in wanted:
                 if key in records:
                     raise DatasetError(f"{dataset.path} repeats the pair {key} of another dataset")
-                records[key] = _slim(dataset.read(*key))
-    return _stacked([records[key] for key in sorted(records)], datasets[0])
+                records[key] = _slim(record := dataset.read(*key))
+                if record.accepted:
+                    lost[key] = _lost(record, dataset.sampling)
+    found = _stacked([records[key] for key in sorted(records)], datasets[0])
+    return dataclasses.replace(found, lost_xi=np.concatenate([lost[key] for key in sorted(lost)]))
 
 
 def select_inputs(examples: Examples, kind: str) -> Examples:
@@ -147,6 +154,12 @@ def _check_alike(ours: Dataset, theirs: Dataset) -> None:
     ]
     if found:
         raise DatasetError(f"{theirs.path} does not go with {ours.path}: {found[0]}")
+
+
+def _lost(record: PairRecord, sampling: SamplingConfig) -> Array:
+    """Return the errors of the registrations that ended in another minimum.  (n, 6)."""
+    far = far_from_truth(record.xi, sampling.cluster_scale_m, sampling.cluster_scale_rad)
+    return record.xi[far]
 
 
 def _slim(record: PairRecord) -> PairRecord:

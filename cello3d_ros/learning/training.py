@@ -14,8 +14,10 @@ import numpy as np
 from scipy.optimize import minimize
 
 from cello3d_ros.config import TrainingConfig
+from cello3d_ros.covariance.lost import Lost, spread_m
 from cello3d_ros.covariance.model import Model, project
 from cello3d_ros.errors import ConfigError, DatasetError
+from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.packed import unpack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import package_versions
@@ -46,6 +48,8 @@ _LEVELS = np.linspace(0.0, 1.0, 101)  # of the quantiles that a model keeps
 _PATIENCE = 20  # iterations without a better validation loss that end training
 _DIVERGED = 1e100  # |Theta|^2, far beyond anything and far below where numbers end
 _BATCH = 16  # targets of one stochastic gradient
+_LOST_QUANTILE = 0.97  # of the pairs' sandwiches; decision 11
+_FEWEST_LOST = 30  # registrations in other minima that make a covariance
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,6 +125,7 @@ def train(
         neighbors_quantiles=np.quantile(neighbors, _LEVELS),
         mean_weight=config.mean_weight,
         margin=config.margin,
+        lost=None if config.shape == "none" else known_lost(examples),
         pipeline=examples.pipeline,
         sampling=examples.sampling,
         provenance=provenance,
@@ -133,6 +138,17 @@ def train(
         interrupted=search.interrupted,
         curve=tuple(search.curve),
     )
+
+
+def known_lost(examples: Examples) -> Lost | None:
+    """Return how to tell registrations in other minima; None where too few were met.
+
+    The limit is what the sandwiches of 3 % of the pairs exceed where ICP started from the truth.
+    """
+    if len(examples.lost_xi) < _FEWEST_LOST or "sandwich" not in examples.shapes:
+        return None
+    limit_m = np.quantile(spread_m(examples.shapes["sandwich"]), _LOST_QUANTILE)
+    return Lost(float(limit_m), sampled_covariance(examples.lost_xi))
 
 
 class _Search:

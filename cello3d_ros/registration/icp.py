@@ -26,7 +26,7 @@ from numba import njit
 from numba.extending import overload
 
 from cello3d_ros.clouds.filters import subsample
-from cello3d_ros.clouds.leaves import Indices, build_leaves, tree_order
+from cello3d_ros.clouds.leaves import Indices, tree_order
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import Array
@@ -37,7 +37,7 @@ from cello3d_ros.registration.candidates import (
     make_room,
     nearest,
 )
-from cello3d_ros.registration.search import Ranked, search
+from cello3d_ros.registration.search import Tree, build_tree, search
 
 REASONS = ("", "max_iterations", "singular", "too_few_points")
 _SLACK = 1.2  # search beyond the last trim limit, in squared distance
@@ -69,7 +69,7 @@ class _Pair(NamedTuple):
     reading: Array
     reference: Array
     normals: Array
-    near: Ranked | Places
+    near: Tree | Places
     mean: Array
 
 
@@ -158,11 +158,9 @@ def _icp_in_order(
     if len(reading) == 0 or len(reference) < config.n_neighbors:
         return _too_few(T_init)
     mean = reference.mean(axis=0)
-    centered = reference - mean
-    order = tree_order(centered)
-    centered = centered[order]
-    near = Ranked(build_leaves(centered), order)
-    return _register_pair(_Pair(reading, centered, normals[order], near, mean), T_init, config)
+    tree = build_tree(reference - mean)
+    pair = _Pair(reading, tree.points, normals[tree.order], tree, mean)
+    return _register_pair(pair, T_init, config)
 
 
 def _too_few(T_init: Array) -> Registration:
@@ -193,10 +191,10 @@ def _register_pair(pair: _Pair, T_init: Array, config: IcpConfig) -> Registratio
 
 
 def _find(
-    moved: Array, index: Ranked | Places, cap2: float, distances2: Array, indices: Indices
+    moved: Array, index: Tree | Places, cap2: float, distances2: Array, indices: Indices
 ) -> int:
     """Fill the k nearest points at most ``cap2`` away, squared, by one index or the other."""
-    find: Callable[..., int] = search if isinstance(index, Ranked) else nearest
+    find: Callable[..., int] = search if isinstance(index, Tree) else nearest
     return find(moved, index, cap2, distances2, indices)
 
 
@@ -204,7 +202,7 @@ def _find(
 def _find_compiled(
     moved: Any, index: Any, cap2: Any, distances2: Any, indices: Any
 ) -> Callable[..., int]:
-    find = search if index.instance_class is Ranked else nearest
+    find = search if index.instance_class is Tree else nearest
     return lambda moved, index, cap2, distances2, indices: find(
         moved, index, cap2, distances2, indices
     )
@@ -215,7 +213,7 @@ def _icp(
     reading: Array,
     reference: Array,
     normals: Array,
-    index: Ranked | Places,
+    index: Tree | Places,
     T: Array,
     k: int,
     trim_ratio: float,
@@ -265,7 +263,7 @@ def _icp(
 @njit(cache=True, nogil=True)
 def _associate(
     moved: Array,
-    index: Ranked | Places,
+    index: Tree | Places,
     trim_ratio: float,
     last_limit: float,
     distances2: Array,

@@ -1,61 +1,99 @@
-"""The nearest neighbours of ICP for one registration: eight queries share a walk down the tree.
+"""The nearest neighbours of ICP: eight queries share a walk down the tree, then no branches.
 
-The tree is that of ``clouds/leaves.py``.  A box or a point is left out only when it is beyond a
-distance that is known to hold k points: for most queries that to the farthest of the neighbours
-found by the search before.  Of equally far points the first in the order they were given in wins,
-so that the answer does not depend on the tree.
+The tree is that of ``clouds/leaves.py``.  Each query compares itself with the points of all leaves
+that may hold a neighbour, sixteen at a time in single precision (``lanes.py``), and picks the
+least; the winners are compared in double precision.  A comparison costs much less than a branch
+that the processor cannot foresee, so that nothing is decided point by point.
+
+Why the answers are exact:
+
+- *Leaves.*  A box is left out only when it is beyond a distance that is known to hold k points:
+  for most queries that to the farthest of the neighbours found by the search before.
+- *Single precision.*  Points and queries are scaled by a power of two, so that no coordinate of a
+  point is above 1.  With Q the greatest of a query, coordinates are wrong by 2^-24 of themselves
+  and distances d by less than e = 2^-22 (1 + Q); keys lack ten bits, 2^-13 of d^2.  So whoever is
+  as near as the k-th, at d, has a key below (d + e)^2 (1 + 2^-12) < d^2 (1 + 2^-11) + 2^13 e^2.
+  All of these are put in order in double precision.
+
+Of equally far points the first in the order they were given in wins, so that the answer does not
+depend on the tree.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from cello3d_ros.clouds.leaves import (
     Indices,
-    Leaves,
     boxes_near,
     boxes_near_box,
+    build_leaves,
     lowest_bit,
-    points_near,
+    tree_order,
 )
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.registration.lanes import lane_keys, least_key_above
 
+_GROUP = 8  # queries that walk together
+_ROWS = 64  # leaves that are compared at a time, as many as six bits can number
+_ABSENT = 0x7F800000  # keys from here on are of no point
 _FAR2 = 1.7e308  # no finite squared distance is searched for beyond
+_FARTHEST = 1e15  # coordinate of a query, scaled, for which float32 holds all distances
 
 
-class Ranked(NamedTuple):
-    """A tree and the rank, (N,), of its points where they are equally far."""
+class Tree(NamedTuple):
+    """N points and what finds the nearest of them.
 
-    leaves: Leaves
+    order: (N,), the tree's order of the points as they were given; points: (N, 3) in that order;
+    lanes: (L, 3, 16), the leaves times ``scale``; boxes, children: as in leaves.py.
+    """
+
     order: Indices
+    points: Array
+    lanes: NDArray[np.float32]
+    scale: float
+    boxes: Array
+    children: Indices
+
+
+def build_tree(points: Array) -> Tree:
+    """Build the tree of (N, 3) points, N > 0."""
+    order = tree_order(points)
+    points = points[order]
+    lanes, boxes, children = build_leaves(points)
+    scale = 2.0 ** -math.frexp(float(np.abs(points).max()))[1]
+    return Tree(order, points, (lanes * scale).astype(np.float32), scale, boxes, children)
 
 
 @njit(cache=True, nogil=True)
-def search(moved: Array, index: Ranked, cap2: float, distances2: Array, indices: Indices) -> int:
+def search(moved: Array, tree: Tree, cap2: float, distances2: Array, indices: Indices) -> int:
     """Fill the k nearest points that are at most ``cap2`` away, squared; return how many.
 
     moved: (M, 3), neighbours in order near in space; distances2, indices: (M, k), closest first,
-    infinite and -1 where there are fewer.  On entry ``indices`` holds the neighbours found by the
-    search before, or -1: k points as good as any, the k-th neighbour cannot be farther than the
-    farthest of them is now.  Eight queries in a row look for their leaves together: a leaf
-    farther from the box around them than the farthest bound of them all concerns none of them.
-    Each of them then compares itself with those leaves only, not with the tree.
+    infinite and -1 where there are fewer; indices are those of ``tree.points``.  On entry they
+    hold the neighbours found by the search before, or -1: k points as good as any, the k-th
+    neighbour cannot be farther than the farthest of them is now.  Eight queries in a row look for
+    their leaves together: a leaf farther from the box around them than the farthest bound of them
+    all concerns none of them.  (Functions that take arrays would cost more here than they do.)
     """
-    (points, boxes, children), order = index
+    order, points, lanes, scale, boxes, children = tree
     n, k = indices.shape
-    n_leaves = len(points)
+    n_leaves = len(lanes)
     near = np.empty(n_leaves, np.int64)  # the leaves near eight queries, and their boxes
     near_boxes = np.empty((n_leaves // 16 + 1, 6, 16))
     stack = np.empty(256, np.int64)
-    bounds2 = np.empty(8)
+    bounds2 = np.empty(_GROUP)
+    keys, rows = np.empty((_ROWS, 16), np.int32), np.empty(_ROWS, np.int64)
     last = np.arange(k)  # some k points, to bound the distance of queries that have no bound
     cap2 = min(cap2, _FAR2)
     total = 0
-    for start in range(0, n, 8):
-        stop = min(start + 8, n)
+    for start in range(0, n, _GROUP):
+        stop = min(start + _GROUP, n)
         x0 = y0 = z0 = np.inf
         x1 = y1 = z1 = -np.inf
         far2 = 0.0
@@ -63,17 +101,14 @@ def search(moved: Array, index: Ranked, cap2: float, distances2: Array, indices:
             x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
             x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
             x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
-            bound2 = 0.0
-            if indices[i, k - 1] >= 0:
+            has_bound = indices[i, k - 1] >= 0
+            bound2 = cap2
+            if has_bound or (cap2 == _FAR2 and k <= len(points)):
+                bound2 = 0.0
                 for j in range(k):
-                    p = indices[i, j]
-                    bound2 = max(bound2, _distance2(points, p >> 4, p & 15, x, y, z))
-            elif cap2 < _FAR2:
-                bound2 = cap2
-            else:
-                for j in range(k):
-                    p = last[j]
-                    bound2 = max(bound2, _distance2(points, p >> 4, p & 15, x, y, z))
+                    p = indices[i, j] if has_bound else last[j]
+                    dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+                    bound2 = max(bound2, dx * dx + dy * dy + dz * dz)
             bounds2[i - start] = min(bound2, cap2)
             far2 = max(far2, bounds2[i - start])
         n_near, top = 0, 1
@@ -101,48 +136,92 @@ def search(moved: Array, index: Ranked, cap2: float, distances2: Array, indices:
         for i in range(start, stop):
             x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
             bound2 = bounds2[i - start]
-            for j in range(k):
-                distances2[i, j] = np.inf
-                indices[i, j] = -1
-            for block in range(n_blocks):
-                mask = boxes_near(near_boxes, block, x, y, z, bound2)
-                while mask:
-                    leaf = near[16 * block + lowest_bit(mask)]
+            size = max(abs(x), abs(y), abs(z)) * scale
+            if not size < _FARTHEST:
+                total += _search_all(points, order, x, y, z, cap2, distances2[i], indices[i])
+                continue
+            xs, ys, zs = np.float32(x * scale), np.float32(y * scale), np.float32(z * scale)
+            error2 = 2.0**-31 * (1.0 + size) ** 2
+            n_found = block = mask = 0
+            while mask or block < n_blocks:  # once, but where more than 64 leaves are near
+                n_rows = 0
+                while n_rows < _ROWS and (mask or block < n_blocks):
+                    if not mask:
+                        mask = boxes_near(near_boxes, block, x, y, z, bound2)
+                        block += 1
+                        continue
+                    leaf = near[16 * block - 16 + lowest_bit(mask)]
                     mask &= mask - 1
-                    hits = points_near(points, leaf, x, y, z, bound2)
-                    while hits:
-                        lane = lowest_bit(hits)
-                        hits &= hits - 1
-                        d2 = _distance2(points, leaf, lane, x, y, z)
-                        _insert(distances2, indices, i, d2, 16 * leaf + lane, order)
-                    bound2 = min(bound2, distances2[i, k - 1])
-            for j in range(k):
-                total += indices[i, j] >= 0
-            if indices[i, k - 1] >= 0:
+                    lane_keys(lanes, leaf, xs, ys, zs, n_rows, keys)
+                    rows[n_rows] = leaf
+                    n_rows += 1
+                most = np.int32(_ABSENT - 1)
+                key = least_key_above(keys, n_rows, np.int32(-1))
+                while key <= most:
+                    p = 16 * rows[np.int64(key >> 4 & 63)] + np.int64(key & 15)
+                    dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+                    d2 = dx * dx + dy * dy + dz * dz
+                    if n_found == k and not _is_before(
+                        d2, order[p], distances2[i, k - 1], order[indices[i, k - 1]]
+                    ):
+                        key = least_key_above(keys, n_rows, key)
+                        continue
+                    n_found = min(n_found + 1, k)
+                    j = n_found - 1
+                    while j > 0:
+                        other2, other = distances2[i, j - 1], indices[i, j - 1]
+                        if not _is_before(d2, order[p], other2, order[other]):
+                            break
+                        distances2[i, j], indices[i, j] = other2, other
+                        j -= 1
+                    distances2[i, j], indices[i, j] = d2, p
+                    if n_found == k:
+                        bound2 = min(bound2, distances2[i, k - 1])
+                        top2 = distances2[i, k - 1] * scale * scale * (1.0 + 2.0**-11) + error2
+                        most = np.int32(np.float32(top2).view(np.int32) | 1023)
+                    key = least_key_above(keys, n_rows, key)
+            if n_found == k:
                 for j in range(k):
                     last[j] = indices[i, j]
+            for j in range(k):
+                is_near = j < n_found and distances2[i, j] <= cap2
+                total += is_near
+                distances2[i, j] = distances2[i, j] if is_near else np.inf
+                indices[i, j] = indices[i, j] if is_near else -1
     return total
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _distance2(points: Array, leaf: int, lane: int, x: float, y: float, z: float) -> float:
-    """Return the squared distance of a point, rounded as in ``points_near``."""
-    dx, dy, dz = points[leaf, 0, lane] - x, points[leaf, 1, lane] - y, points[leaf, 2, lane] - z
-    return float(dx * dx + dy * dy + dz * dz)
+@njit(cache=True, nogil=True)
+def _search_all(
+    points: Array,
+    order: Indices,
+    x: float,
+    y: float,
+    z: float,
+    cap2: float,
+    distances2: Array,
+    indices: Indices,
+) -> int:
+    """Fill the neighbours of one query, looking at all points in double precision."""
+    n_found = 0
+    for p in range(len(points)):
+        d2 = (points[p, 0] - x) ** 2 + (points[p, 1] - y) ** 2 + (points[p, 2] - z) ** 2
+        if not d2 <= cap2:
+            continue
+        j = min(n_found, len(indices) - 1)
+        if n_found == len(indices) and not _is_before(
+            d2, order[p], distances2[j], order[indices[j]]
+        ):
+            continue
+        n_found = min(n_found + 1, len(indices))
+        while j > 0 and _is_before(d2, order[p], distances2[j - 1], order[indices[j - 1]]):
+            distances2[j], indices[j] = distances2[j - 1], indices[j - 1]
+            j -= 1
+        distances2[j], indices[j] = d2, p
+    distances2[n_found:], indices[n_found:] = np.inf, -1
+    return n_found
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _insert(
-    distances2: Array, indices: Indices, i: int, d2: float, p: int, order: Indices
-) -> None:
-    """Put a point in its place among the neighbours of query i, the farthest falls out."""
-    j = distances2.shape[1] - 1
-    if d2 > distances2[i, j] or (d2 == distances2[i, j] and order[p] > order[indices[i, j]]):
-        return
-    while j > 0 and (
-        d2 < distances2[i, j - 1]
-        or (d2 == distances2[i, j - 1] and order[p] < order[indices[i, j - 1]])
-    ):
-        distances2[i, j], indices[i, j] = distances2[i, j - 1], indices[i, j - 1]
-        j -= 1
-    distances2[i, j], indices[i, j] = d2, p
+def _is_before(d2: float, rank: int, other2: float, other: int) -> bool:
+    return bool(d2 < other2 or (d2 == other2 and rank < other))

@@ -40,6 +40,7 @@ _TRAJECTORIES: _Columns = (
     ("runs", "n_runs", "d"),
     ("failed", "n_failed", "d"),
     ("lost", "n_lost", "d"),
+    ("told lost", "n_told", "d"),
     ("D_M (ideal 2.35)", "dm_6dof", ".2f"),
     ("translation (1.60)", "dm_translation", ".2f"),
     ("rotation (1.60)", "dm_rotation", ".2f"),
@@ -100,7 +101,8 @@ def _body(report: dict[str, Any], clouds: Clouds) -> Iterator[str]:
     yield "that suits these very pairs best.</p>"
     yield table("Methods, all recordings", _METHODS, report["methods"])
     for name, part in report["recordings"].items():
-        title = f"{html.escape(name)} ({int(part['n_pairs'])} pairs)"
+        seen = ", which the model was trained or validated on" if part.get("trained_on") else ""
+        title = f"{html.escape(name)} ({int(part['n_pairs'])} pairs){seen}"
         yield f"<details><summary>{title}</summary>"
         yield table(title, _METHODS, part["methods"]) + "</details>"
     yield "<h2>Calibration</h2>"

@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.shape import Cloud
-from cello3d_ros.config import IcpConfig, Pipeline, SamplingConfig
+from cello3d_ros.config import IcpConfig, Pipeline
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array, exp, transform
-from cello3d_ros.learning.clustering import nearest_cluster
 from cello3d_ros.reproduction import drawing
-from cello3d_ros.reproduction.result import Result
-from cello3d_ros.reproduction.scenes import cylinder, errors
+from cello3d_ros.reproduction.result import Result, listing
+from cello3d_ros.reproduction.scenes import cylinder, errors, kept_of
 
 _DEVIATIONS = np.repeat([0.5, 0.9], 3)  # of the starts: m, rad
 _UPSIDE_DOWN_RAD = 3.0
@@ -27,24 +26,17 @@ def make(n_samples: int, n_threads: int, seed: int) -> Result:
     reading, reference = (cylinder(rng, 10_000, 0.01) for _ in range(2))
     starts = rng.normal(size=(n_samples, 6)) * _DEVIATIONS
     xi = errors(reading, reference, starts, pipeline, n_threads, seed)
-    sampling = SamplingConfig()
-    kept = nearest_cluster(
-        xi, sampling.cluster_scale_m, sampling.cluster_scale_rad, sampling.cluster_min_share
-    )
+    kept = kept_of(xi)
     Y = sampled_covariance(xi[kept])
     tilt = np.linalg.norm(xi[:, 3:5], axis=1)
     ring = np.linalg.norm(xi[:, 3:], axis=1) > _UPSIDE_DOWN_RAD
     ring &= tilt > 0.1
     spread = np.sqrt(np.diag(Y))
     data = {
-        "n_samples": len(xi),
-        "n_kept": int(kept.sum()),
         "n_upside_down": int(ring.sum()),
         "n_upside_down_kept": int((ring & kept).sum()),
         "covariance": Y.tolist(),
         "starts": np.round(starts, 5).tolist(),
-        "xi": np.round(xi, 6).tolist(),
-        "kept": kept.astype(int).tolist(),
     }
     text = (
         f"{len(xi)} registrations of two cylinders of 1 m by 2 m, from starts of "
@@ -54,13 +46,10 @@ def make(n_samples: int, n_threads: int, seed: int) -> Result:
         f"other angles spread by {1e3 * np.hypot(*spread[3:5]):.1f} mrad and the position by "
         f"{1e3 * np.linalg.norm(spread[:3]):.1f} mm."
     )
-    rows = [
-        ["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "kept"],
-        *([*x, int(k)] for x, k in zip(np.round(xi, 6).tolist(), kept, strict=True)),
-    ]
     figure = _figure(reading, reference, starts, xi, kept)
     title = "Cylinders: clusters kept and dropped"
-    return Result("fig-cylinder", title, text, data, rows, figure)
+    listed, rows = listing(xi, kept)
+    return Result("fig-cylinder", title, text, data | listed, rows, figure)
 
 
 def _figure(

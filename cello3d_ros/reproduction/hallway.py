@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.shape import Cloud
-from cello3d_ros.config import Pipeline, SamplingConfig
+from cello3d_ros.config import Pipeline
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.learning.clustering import nearest_cluster
 from cello3d_ros.reproduction import drawing
-from cello3d_ros.reproduction.result import Result
-from cello3d_ros.reproduction.scenes import errors, hallway
+from cello3d_ros.reproduction.result import Result, listing
+from cello3d_ros.reproduction.scenes import errors, hallway, kept_of
 
 _PITCH_M = 1.0
 _DEVIATIONS = np.array([0.55, 0.2, 0.2, 0.1, 0.1, 0.1])  # of the starts: m, rad
@@ -26,10 +25,7 @@ def make(n_samples: int, n_threads: int, seed: int) -> Result:
     reading, reference = (hallway(rng, 6000, 0.01, _PITCH_M) for _ in range(2))
     starts = rng.normal(size=(n_samples, 6)) * _DEVIATIONS
     xi = errors(reading, reference, starts, Pipeline(), n_threads, seed)
-    sampling = SamplingConfig()
-    kept = nearest_cluster(
-        xi, sampling.cluster_scale_m, sampling.cluster_scale_rad, sampling.cluster_min_share
-    )
+    kept = kept_of(xi)
     Y, Y_kept = sampled_covariance(xi), sampled_covariance(xi[kept])
     pillar = np.round(xi[:, 0] / _PITCH_M).astype(int)
     on_pillar = np.abs(xi[:, 0] - _PITCH_M * pillar) < 0.1 * _PITCH_M
@@ -37,14 +33,10 @@ def make(n_samples: int, n_threads: int, seed: int) -> Result:
     axis = np.linalg.eigh(Y[:3, :3])[1][:, -1]
     data = {
         "pitch_m": _PITCH_M,
-        "n_samples": len(xi),
-        "n_kept": int(kept.sum()),
         "share_at_pillar": shares,
         "covariance_all": Y.tolist(),
         "covariance_kept": Y_kept.tolist(),
         "cosine_leading_axis_hallway": float(abs(axis[0])),
-        "xi": np.round(xi, 6).tolist(),
-        "kept": kept.astype(int).tolist(),
     }
     text = (
         f"A hallway with pillars each {_PITCH_M:g} m; starts deviate by {_DEVIATIONS[0]:g} m "
@@ -54,13 +46,10 @@ def make(n_samples: int, n_threads: int, seed: int) -> Result:
         f"{np.sqrt(Y[0, 0]):.2f} m; that of the cluster kept for training has "
         f"{1e3 * np.sqrt(Y_kept[0, 0]):.1f} mm."
     )
-    rows = [
-        ["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "kept"],
-        *([*x, int(k)] for x, k in zip(np.round(xi, 6).tolist(), kept, strict=True)),
-    ]
     figure = _figure(reading, reference, starts, xi, kept, Y)
     title = "Hallway with regular pillars"
-    return Result("fig-hallway", title, text, data, rows, figure)
+    listed, rows = listing(xi, kept)
+    return Result("fig-hallway", title, text, data | listed, rows, figure)
 
 
 def _figure(

@@ -11,7 +11,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cello3d_ros.errors import Cello3dError
+from cello3d_ros.geometry.se3 import Array
 
 _HEAD = """# Results
 
@@ -33,6 +37,17 @@ class Result(NamedTuple):
     data: dict[str, Any]
     rows: list[list[Any]]
     figure: Any
+
+
+def listing(xi: Array, kept: NDArray[np.bool_]) -> tuple[dict[str, Any], list[list[Any]]]:
+    """Return a pair's registrations, and which of them training keeps, as data and as rows.
+
+    xi: (n, 6), errors about the truth, m and rad.  kept: (n,).
+    """
+    twists, flags = np.round(xi, 6).tolist(), kept.astype(int).tolist()
+    data = {"n_samples": len(xi), "n_kept": int(kept.sum()), "xi": twists, "kept": flags}
+    heading = ["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "kept"]
+    return data, [heading, *([*x, k] for x, k in zip(twists, flags, strict=True))]
 
 
 def publish(result: Result, out: Path, page: Path, command: str, cpu_s: float) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cello3d_ros.clouds.shape import Cloud, prepare
-from cello3d_ros.config import CloudConfig, Pipeline
+from cello3d_ros.config import CloudConfig, Pipeline, SamplingConfig
 from cello3d_ros.covariance.closed_form import censi
 from cello3d_ros.geometry.se3 import Array, exp, log
+from cello3d_ros.learning.clustering import nearest_cluster
 from cello3d_ros.registration.icp import register_many
 from cello3d_ros.registration.overlap import find_overlap
 
@@ -102,3 +104,11 @@ def censi_of(
     icp = pipeline.icp
     found = find_overlap(reading, reference, T, pipeline.overlap.radius_m, icp.n_neighbors)
     return censi(reading, reference, T, found.distances2, found.indices, icp, sigma_m)
+
+
+def kept_of(xi: Array) -> NDArray[np.bool_]:
+    """Return which registrations training would keep: the cluster nearest to the truth.  (n,)."""
+    sampling = SamplingConfig()
+    return nearest_cluster(
+        xi, sampling.cluster_scale_m, sampling.cluster_scale_rad, sampling.cluster_min_share
+    )

@@ -47,7 +47,8 @@ def make(
         f"(starts of variance 0.05, covariances compounded to 4th order), {source}. A consistent "
         f"covariance has D_M of {IDEAL_6DOF} in 6 degrees of freedom and {IDEAL_3DOF:.2f} in 3; "
         f"more is optimistic, less is pessimistic. *Lost* runs had a registration end in another "
-        f"minimum; they are in all figures, as in the paper.\n\n"
+        f"minimum; they are in all figures, as in the paper. The relative model tells lost "
+        f"registrations and covers them (`docs/decisions/0011`); the paper's does not.\n\n"
         f"Relative model:\n\n{markdown_table(_table(rows, 'relative'))}\n\n"
         f"Paper's model:\n\n{markdown_table(_table(rows, 'paper'))}"
     )
@@ -83,6 +84,7 @@ def _sequence(workshop: Workshop, recordings: Any, model: Any, n_runs: int) -> d
         np.concatenate([r.xi for r in all_runs]),
         np.concatenate([r.Y for r in all_runs]),
         np.concatenate([r.lost for r in all_runs]),
+        np.concatenate([r.told for r in all_runs]),
         sum(r.n_failed for r in all_runs),
     )
     return {"length_m": float(np.mean(lengths)), **consistency(runs)}

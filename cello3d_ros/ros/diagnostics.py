@@ -10,6 +10,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from cello3d_ros.config import NodeConfig
+from cello3d_ros.covariance.estimator import Estimate
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.ros.covariances import N_SIGMA, principal_axes
 from cello3d_ros.ros.messages import time_of
@@ -30,15 +31,18 @@ class Verdict(NamedTuple):
     sentence: str
 
 
-def judged(C: Array, is_unknown: bool, config: NodeConfig) -> Verdict:
-    """Judge an answer by its covariance (6, 6), as published, and by its kin in the model."""
+def judged(C: Array, found: Estimate, config: NodeConfig) -> Verdict:
+    """Judge an answer by its covariance (6, 6), as published, and by what the model says of it."""
     longest_m = N_SIGMA * float(principal_axes(C[:3, :3])[0][0])
     level, reasons = OK, []
     for worse, name in ((WARN, "warn_sigma_m"), (ERROR, "error_sigma_m")):
         if longest_m > (limit_m := getattr(config, name)):
             level = worse
             reasons = [f"3 sigma are {longest_m:.3g} m, more than node.{name} {limit_m:g}"]
-    if is_unknown:
+    if found.is_lost:
+        level = max(level, WARN)
+        reasons.append("probably lost: the scans do not fit as they do where ICP is right")
+    if found.is_unknown:
         level = max(level, WARN)
         reasons.append("out of distribution: the pair is unlike all that the model has seen")
     return Verdict(level, "; ".join(reasons) or "answered")
@@ -168,6 +172,7 @@ def _described(answer: Answer, C: Array) -> dict[str, str]:
         "novelty": f"{found.novelty:.3f}",
         "effective_neighbors": f"{found.effective_neighbors:.3f}",
         "out_of_distribution": str(found.is_unknown).lower(),
+        "probably_lost": str(found.is_lost).lower(),
         "long_axis_3_sigma_m": f"{N_SIGMA * sigma_m[0]:.6g}",
         "weakest_sigma_m": f"{sigma_m[0]:.6g}",
         "weakest_direction": _numbers(axes[:, 0], "{:.3f}"),

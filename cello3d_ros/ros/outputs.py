@@ -53,7 +53,7 @@ class Outputs:
         )
         odometry = messages.full_odometry(pose, answer.child_frame_id, *_twist(answer, config))
         C: Array = relative.pose.covariance.reshape(6, 6)
-        verdict = judged(C, found.is_unknown, config)
+        verdict = judged(C, found, config)
         self._odometry.publish(odometry)
         self._relative.publish(relative)
         self._pose.publish(pose)

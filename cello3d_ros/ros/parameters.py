@@ -21,8 +21,7 @@ _FIXED = {"cloud", "grid", "sampling", "training"}  # sections read once, by con
 _FIXED_SETTINGS = {
     *(MODEL, AUTOSTART),
     *("node.T_base_sensor", "node.odometry_buffer_s", "node.seed"),
-    *("node.unknown_quantile", "node.publish_tf"),
-    *("node.pairing", "node.registration", "node.use_tf"),
+    *("node.pairing", "node.registration", "node.use_tf", "node.publish_tf"),
 }
 _INT64 = 2**63 - 1
 

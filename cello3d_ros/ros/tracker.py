@@ -16,7 +16,6 @@ from cello3d_ros.config import NodeConfig, Pipeline
 from cello3d_ros.covariance.estimator import Estimate, estimate, needs_shape
 from cello3d_ros.covariance.methods import METHODS, MethodSettings
 from cello3d_ros.covariance.model import Model
-from cello3d_ros.covariance.novelty import rho_limit
 from cello3d_ros.errors import CloudError, ModelError, NoOverlapError, RegistrationError
 from cello3d_ros.geometry.gaussian import GaussianPose, compound_right, is_positive_definite
 from cello3d_ros.geometry.se3 import Array, inverse
@@ -77,13 +76,13 @@ class Tracker:
 
     def __init__(self, model: Model, pipeline: Pipeline, config: NodeConfig) -> None:
         self.model, self.pipeline, self.config = model, pipeline, config
-        self._rho_limit = rho_limit(model, config.unknown_quantile)
         self.n_failures = 0  # in a row, against the present reference
         self.n_restarts = 0
         self.last_restart = ""
         self._map: Map | None = None
         self._reference: Link | None = None
         self._latest: Link | None = None
+        self._rival: Link | None = None  # failed against a first scan that nothing has fitted
         self._motion = Motion()
         self._T_map_odom: Array = _ORIGIN
 
@@ -92,7 +91,7 @@ class Tracker:
         if self._reference is not None:
             self.n_restarts += 1
             self.last_restart = reason
-        self._reference = self._latest = None
+        self._reference = self._latest = self._rival = None
         self._motion = Motion()
         self._T_map_odom = _ORIGIN
         self.n_failures = 0
@@ -115,7 +114,8 @@ class Tracker:
         points: (N, 3), sensor frame.  Returns None for a scan that only starts a chain.
         Raises CloudError, RegistrationError or ModelError (the pair is beyond the model) when
         there is no answer: the reference stays, until ``max_failures`` scans in a row have failed
-        against it; then the chain starts again at the last of them.
+        against it; then the chain starts again at the last of them.  It starts again at once
+        where nothing has fitted the first scan of a chain and two scans after it fit each other.
         """
         rng = np.random.default_rng([self.config.seed, stamp_ns & (2**64 - 1)])
         cloud = filtered(points, self.pipeline.cloud, rng, _N_THREADS)
@@ -127,7 +127,7 @@ class Tracker:
         if self.config.pairing == "topics":
             self._reference = self._map_around(frame)
         elif self._reference is None:
-            self._start_at(frame)
+            self._begin(self._first(frame, _ORIGIN))
             return None
         self.finish()
         reference = self._reference
@@ -135,8 +135,13 @@ class Tracker:
         try:
             answer = self._answer(frame, reference, rng)
         except (RegistrationError, ModelError):
-            self._fail(frame)
-            raise
+            rival, match = self._rival, self._match(frame, self._rival, rng)
+            if rival is None or match is None:
+                self._fail(frame)
+                raise
+            self.reset("two scans fit each other but not the first of the chain")
+            self._begin(rival)
+            answer, reference = match, rival
         self._accept(frame, answer, reference)
         return self._published(answer, place, reference)
 
@@ -221,6 +226,13 @@ class Tracker:
             offset=None if external is None else external.offset,
         )
 
+    def _match(self, frame: Frame, rival: Link | None, rng: np.random.Generator) -> Answer | None:
+        """Return what a scan is to the one that failed before it, or None."""
+        try:
+            return None if rival is None else self._answer(frame, rival, rng)
+        except (RegistrationError, ModelError):
+            return None
+
     def _guess(self, reading: Frame, reference: Link) -> tuple[Array, str]:
         """Return the first guess of T_ref_read and where it comes from."""
         T_odom_ref, T_odom_read = reference.frame.T_odom_sensor, reading.T_odom_sensor
@@ -237,6 +249,7 @@ class Tracker:
             frame = replace(frame, T_odom_sensor=T_odom_ref @ T_ref_read)
         self._latest = Link(frame, answer.T_odom_read, answer.Y_chain)
         self._motion.add(frame.stamp_ns, answer.T_odom_read)
+        self._rival = None
         self.n_failures = 0
         if self.config.pairing == "topics":
             if place.guess == ODOMETRY and place.T_odom_sensor is not None:
@@ -278,7 +291,7 @@ class Tracker:
         return MethodSettings(
             sigma_m=config.sensor_sigma_m,
             n_registrations=config.n_registrations,
-            rho_limit=self._rho_limit,
+            unknown_quantile=config.unknown_quantile,
             widen_unknown=config.inflate_unknown,
             scale=config.scale,
             n_threads=_N_THREADS,
@@ -288,20 +301,26 @@ class Tracker:
         self.n_failures += 1
         if self.n_failures >= self.config.max_failures:
             self._restart_at(frame, f"{self.n_failures} failures in a row")
-        elif self.config.pairing == "keyframe":
+            return
+        if self.config.pairing == "keyframe":
             self._reference = self._latest  # the keyframe may be too far away by now
+        if self._latest is not None and not self._latest.Y.any():  # it is the first
+            self._rival = self._first(frame, self._motion.at(frame.stamp_ns))
 
     def _restart_at(self, frame: Frame, reason: str) -> None:
         T_odom_sensor = self._motion.at(frame.stamp_ns)
         self.reset(reason)
         if self.config.pairing != "topics":
-            self._start_at(frame, T_odom_sensor)
+            self._begin(self._first(frame, T_odom_sensor))
 
-    def _start_at(self, frame: Frame, T_predicted: Array = _ORIGIN) -> None:
-        """Begin a chain where odometry puts the frame or, without it, where it is expected."""
+    def _first(self, frame: Frame, T_predicted: Array) -> Link:
+        """Return the start of a chain, where odometry puts it or, without it, as expected."""
         T = T_predicted if frame.T_odom_sensor is None else frame.T_odom_sensor
-        self._reference = self._latest = Link(frame, T, np.zeros((6, 6)))
-        self._motion.add(frame.stamp_ns, T)
+        return Link(frame, T, np.zeros((6, 6)))
+
+    def _begin(self, link: Link) -> None:
+        self._reference = self._latest = link
+        self._motion.add(link.frame.stamp_ns, link.T)
 
 
 def reason_of(error: Exception) -> str:

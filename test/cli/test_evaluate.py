@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from cello3d_ros.cli.main import main
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import SamplingConfig
 from cello3d_ros.covariance.features import FEATURES
-from cello3d_ros.covariance.model import constant_model, save_model
+from cello3d_ros.covariance.model import constant_model, load_model, save_model
 from cello3d_ros.geometry.se3 import Array, exp, inverse, transform
 from cello3d_ros.learning.dataset import PairRecord, open_dataset
 from cello3d_ros.registration.icp import Registration
@@ -20,6 +21,7 @@ from cello3d_ros.registration.icp import Registration
 METHODS = {
     "mean_covariance",
     "model",
+    "model_widened",
     "constant",
     "hessian",
     "hessian_scaled",
@@ -177,6 +179,33 @@ def test_recordings_that_the_model_has_seen_are_refused(
     assert "hall_s2" not in said
     assert not (folder / "e.json").exists()
     assert evaluate(folder, "--allow-seen") == 0
+
+
+def test_a_recording_that_the_model_has_seen_under_another_name_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = load_model(folder / "model.npz")
+    prints = {"hall_s0": ["one", "1a"], "hall_s1": ["two", "2a", "2b"]}
+    provenance = {**model.provenance, "prints": prints}
+    save_model(replace(model, provenance=provenance), folder / "model.npz")
+    dataset = open_dataset(folder / "set")
+    for name, facts in (
+        ("hall_s2", {"fingerprint": "four", "scans": ["2b", "2c"]}),  # a crop of hall_s1
+        ("walk", {"fingerprint": "three", "scans": ["3a"]}),
+    ):
+        dataset.add_recording(name, facts)
+    words = ("--only", "hall_s2", "walk", "--json", folder / "e.json")
+    assert evaluate(folder, *words) == 1
+    assert "trained or validated on hall_s2 (as hall_s1): choose" in complaint(capsys)
+    assert evaluate(folder, *words, "--allow-seen") == 0
+    recordings = json.loads((folder / "e.json").read_text())["recordings"]
+    assert {name: part["trained_on"] for name, part in recordings.items()} == {
+        "hall_s2": True,
+        "walk": False,
+    }
+    said = capsys.readouterr().out
+    assert "hall_s2: the model was trained or validated on it" in said
+    assert "walk: the model was trained" not in said
 
 
 def test_methods_on_clouds_and_trajectories(folder: Path, walk: Path) -> None:

@@ -79,6 +79,8 @@ def test_a_model_with_its_provenance_and_a_table_come_out(
     assert model.shape == "sandwich"
     assert model.provenance["recordings"] == {"hall_s0": 5, "hall_s1": 5, "wood_s0": 5}
     assert model.provenance["validation_recordings"] == {"hall_s3": 5, "wood_s3": 5}
+    names = ("hall_s0", "hall_s1", "hall_s3", "wood_s0", "wood_s3")
+    assert model.provenance["prints"] == {name: [f"of {name}"] for name in names}
     assert model.provenance["rejected_pairs"] == {"offset": 3}
     assert model.provenance["training"]["seed"] == 0
     assert model.provenance["versions"]["numpy"] == np.__version__

@@ -193,20 +193,21 @@ def two_examples(pair, far: float):
         scale=np.ones(len(d)),
         projections=np.array([[place + far], [place + far + 100.0]]),
         covariances=np.array([1e-6 * np.eye(6), 1e-2 * np.diag([1.0, 1, 1, 1e-6, 1, 1])]),
+        rho_quantiles=np.array([0.0, 4.0, 8.0]),
     )
 
 
 @pytest.mark.parametrize("method", ["model", "fused"])
 def test_a_prediction_far_from_every_example_is_widened_to_their_mean(pair, method):
-    model, settings = two_examples(pair, 3.0), MethodSettings(rho_limit=4.0, widen_unknown=True)
-    assert settings.rho_limit < 9.0
+    model = two_examples(pair, 3.0)
+    settings = MethodSettings(unknown_quantile=0.5, widen_unknown=True)
     rng = [np.random.default_rng(5) for _ in range(3)]
     plain = estimate(*pair, T_TRUE, model, PIPELINE, rng[0], method)
     found = estimate(*pair, T_TRUE, model, PIPELINE, rng[1], method, settings)
     mean = model.covariances.mean(axis=0)
     if method == "fused":  # twelve registrations weigh in
         mean = mean * PRIOR_WEIGHT / (PRIOR_WEIGHT + settings.n_registrations)
-    assert found.nearest_rho == plain.nearest_rho > settings.rho_limit
+    assert found.nearest_rho == plain.nearest_rho
     assert (plain.is_unknown, found.is_unknown) == (False, True)
     for smaller in (plain.covariance, mean):
         assert np.linalg.eigvalsh(found.covariance - smaller)[0] > -1e-15
@@ -219,7 +220,7 @@ def test_a_prediction_far_from_every_example_is_widened_to_their_mean(pair, meth
 
 def test_what_does_not_come_from_the_model_is_not_widened(pair):
     model, rng = two_examples(pair, 3.0), [np.random.default_rng(5) for _ in range(2)]
-    settings = MethodSettings(rho_limit=4.0, widen_unknown=True)
+    settings = MethodSettings(unknown_quantile=0.5, widen_unknown=True)
     plain = estimate(*pair, T_TRUE, model, PIPELINE, rng[0], "hessian")
     found = estimate(*pair, T_TRUE, model, PIPELINE, rng[1], "hessian", settings)
     np.testing.assert_array_equal(found.covariance, plain.covariance)
@@ -230,7 +231,7 @@ def test_an_answer_far_from_every_example_is_only_told_of_unless_it_is_to_be_wid
     model = two_examples(pair, 3.0)
     rng = [np.random.default_rng(5) for _ in range(2)]
     plain = estimate(*pair, T_TRUE, model, PIPELINE, rng[0])
-    settings = MethodSettings(rho_limit=4.0)
+    settings = MethodSettings(unknown_quantile=0.5)
     found = estimate(*pair, T_TRUE, model, PIPELINE, rng[1], settings=settings)
     np.testing.assert_array_equal(found.covariance, plain.covariance)
     assert found.is_unknown
@@ -241,7 +242,7 @@ def test_an_answer_is_scaled_last(pair):
     plain, scaled = (
         estimate(
             *(*pair, T_TRUE, model, PIPELINE, np.random.default_rng(5)),
-            settings=MethodSettings(rho_limit=4.0, widen_unknown=True, scale=scale),
+            settings=MethodSettings(unknown_quantile=0.5, widen_unknown=True, scale=scale),
         )
         for scale in (1.0, 2.5)
     )

@@ -17,6 +17,7 @@ import pytest
 
 from cello3d_ros.config import CloudConfig, GridConfig, IcpConfig, Pipeline, SamplingConfig
 from cello3d_ros.covariance.features import FEATURES
+from cello3d_ros.covariance.lost import Lost
 from cello3d_ros.covariance.model import (
     SHIPPED,
     Model,
@@ -306,7 +307,7 @@ def test_a_model_is_read_only_and_leaves_its_arguments_writable() -> None:
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
     path = tmp_path / "model.npz"
-    save_model(a_model(provenance={"seeds": [1, 2]}), path)
+    save_model(a_model(provenance={"seeds": [1, 2]}, lost=Lost(0.0128, np.eye(6))), path)
     return path
 
 
@@ -356,6 +357,7 @@ def test_a_saved_model_comes_back_bit_by_bit(tmp_path: Path, cutoff: float) -> N
             grid=GridConfig(n_cells=(2, 3, 4), extent_m=(1 / 7, 2.0, 3.0)),
         ),
         sampling=SamplingConfig(variance=0.02, seed=7),
+        lost=Lost(1 / 3, covariances(1, seed=9)[0]),
         provenance={"recordings": ["a", "é"], "kl": {"mean": 1 / 3}, "tuple": (1, 2), "n": None},
     )
     save_model(model, tmp_path / "m.npz")
@@ -366,6 +368,10 @@ def test_a_saved_model_comes_back_bit_by_bit(tmp_path: Path, cutoff: float) -> N
         assert ours.tobytes() == theirs.tobytes()
     for name in ("shape", "mean_weight", "cutoff_rho", "pipeline", "sampling", "provenance"):
         assert getattr(model, name) == getattr(back, name)
+    assert model.lost is not None
+    assert back.lost is not None
+    assert model.lost.limit_m == back.lost.limit_m
+    np.testing.assert_array_equal(model.lost.covariance, back.lost.covariance)
     d, S = descriptors(1, seed=21)[0], covariances(1, seed=22)[0]
     ours, theirs = predict(model, d, S), predict(back, d, S)
     np.testing.assert_array_equal(ours.covariance, theirs.covariance)
@@ -517,7 +523,21 @@ HEADERS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "cutoff": (lambda h: h.update(cutoff_rho="far"), "cutoff_rho must be a number"),
     "provenance": (lambda h: h.update(provenance="me"), "provenance must be a mapping"),
     "nan": (lambda h: h.update(provenance={"x": math.nan}), "provenance cannot"),
+    "lost": (lambda h: h.update(lost=[3]), "'lost' is not a limit_m and a covariance"),
+    "lost limit": (lambda h: h["lost"].update(limit_m=-1.0), "limit_m must be positive"),
+    "lost word": (lambda h: h["lost"].update(limit_m="wide"), "limit_m must be a number"),
+    "lost matrix": (
+        lambda h: h["lost"].update(covariance=[[0.0] * 6] * 6),
+        "lost.covariance is not a positive definite",
+    ),
+    "lost extent": (lambda h: h["lost"].update(covariance=[1.0]), "positive definite 6x6"),
+    "lost item": (lambda h: h["lost"].pop("limit_m"), "not a limit_m and a covariance"),
 }
+
+
+def test_a_model_made_before_lost_registrations_were_known_knows_nothing(saved: Path) -> None:
+    change_header(saved, lambda h: h.pop("lost"))
+    assert load_model(saved).lost is None
 
 
 @pytest.mark.parametrize("case", HEADERS)

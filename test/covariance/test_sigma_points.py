@@ -34,6 +34,13 @@ def overlap(pair):
     return find_overlap(*pair, T_HAT, 0.3, Pipeline().icp.n_neighbors)
 
 
+def seen(pair):
+    """Clouds, pose, associations and H^-1: what is known of the pair."""
+    found = overlap(pair)
+    H_inverse = closed_form(*pair, T_HAT, found.distances2, found.indices, Pipeline().icp).hessian
+    return *pair, T_HAT, found, H_inverse
+
+
 def pretend(monkeypatch, answer):
     """Put ``answer(T_init) -> (T, reason)`` in place of ICP."""
 
@@ -60,27 +67,23 @@ def test_the_sensor_term_is_that_of_two_clouds_and_a_common_bias(pair):
     b = common_bias(reading, reference, T_HAT, *found, icp)
     H_inverse = closed_form(reading, reference, T_HAT, *found, icp).hessian
     expected = 0.03**2 * (2 * H_inverse + 2 * np.outer(b, b))
-    np.testing.assert_allclose(
-        sensor_term(*pair, T_HAT, overlap(pair), Pipeline(), 0.03), expected, rtol=1e-9
-    )
+    np.testing.assert_allclose(sensor_term(*seen(pair), Pipeline(), 0.03), expected, rtol=1e-9)
     assert np.abs(np.outer(b, b)).max() > H_inverse.max()
 
 
 def test_an_icp_that_stays_put_gives_the_prior_and_the_sensor_term(pair, monkeypatch):
     pretend(monkeypatch, lambda T: (T, ""))
     rng, prior = np.random.default_rng(0), some_prior()
-    Y = sigma_points(*pair, T_HAT, overlap(pair), Pipeline(), prior, 0.01, rng)
-    expected = prior + sensor_term(*pair, T_HAT, overlap(pair), Pipeline(), 0.01)
+    Y = sigma_points(*seen(pair), Pipeline(), prior, 0.01, rng)
+    expected = prior + sensor_term(*seen(pair), Pipeline(), 0.01)
     np.testing.assert_allclose(Y, expected, atol=1e-12)
 
 
 def test_an_icp_that_always_comes_back_leaves_the_sensor_term(pair, monkeypatch):
     pretend(monkeypatch, lambda T: (T_HAT, "max_iterations"))
     rng = np.random.default_rng(0)
-    Y = sigma_points(*pair, T_HAT, overlap(pair), Pipeline(), some_prior(), 0.03, rng)
-    np.testing.assert_allclose(
-        Y, 9.0 * sensor_term(*pair, T_HAT, overlap(pair), Pipeline(), 0.01), rtol=1e-6
-    )
+    Y = sigma_points(*seen(pair), Pipeline(), some_prior(), 0.03, rng)
+    np.testing.assert_allclose(Y, 9.0 * sensor_term(*seen(pair), Pipeline(), 0.01), rtol=1e-6)
     assert is_positive_definite(Y)
 
 
@@ -89,19 +92,17 @@ def test_starts_without_an_answer_do_not_count(pair, monkeypatch):
     answers = iter([(away, ""), *[(np.full((4, 4), 7.0), "singular")] * 11])
     pretend(monkeypatch, lambda T: next(answers))
     rng = np.random.default_rng(0)
-    Y = sigma_points(*pair, T_HAT, overlap(pair), Pipeline(), some_prior(), 0.01, rng)
-    expected = sensor_term(*pair, T_HAT, overlap(pair), Pipeline(), 0.01)
+    Y = sigma_points(*seen(pair), Pipeline(), some_prior(), 0.01, rng)
+    expected = sensor_term(*seen(pair), Pipeline(), 0.01)
     expected[0, 0] += 0.01
     np.testing.assert_allclose(Y, expected, atol=1e-9)
     pretend(monkeypatch, lambda T: (T, "singular"))
     with pytest.raises(RegistrationError, match="no answer"):
-        sigma_points(*pair, T_HAT, overlap(pair), Pipeline(), some_prior(), 0.01, rng)
+        sigma_points(*seen(pair), Pipeline(), some_prior(), 0.01, rng)
 
 
 def test_in_a_room_most_starts_come_back(pair):
     prior = 1e-3 * np.eye(6)
-    Y = sigma_points(
-        *pair, T_HAT, overlap(pair), Pipeline(), prior, 0.01, np.random.default_rng(5)
-    )
+    Y = sigma_points(*seen(pair), Pipeline(), prior, 0.01, np.random.default_rng(5))
     assert is_positive_definite(Y)
     assert np.trace(Y) < 0.1 * np.trace(prior)

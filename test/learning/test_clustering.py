@@ -7,7 +7,7 @@ import pytest
 
 from cello3d_ros.config import SamplingConfig
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.learning.clustering import nearest_cluster, offset
+from cello3d_ros.learning.clustering import far_from_truth, nearest_cluster, offset
 
 CONFIG = SamplingConfig()
 NOISE = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005])
@@ -21,6 +21,18 @@ def kept(xi: Array) -> np.ndarray:
 
 def noise(n: int, seed: int = 0) -> Array:
     return np.random.default_rng(seed).normal(size=(n, 6)) * NOISE
+
+
+def test_far_is_more_than_three_scales_in_translation_or_rotation() -> None:
+    xi = np.array(
+        [
+            [0.2, 0.2, 0.0, 0.0, 0.0, 0.149],
+            [0.2, 0.2, 0.2, 0.0, 0.0, 0.0],
+            [0.0, 0.0, 0.0, 0.11, 0.0, 0.11],
+        ]
+    )
+    assert far_from_truth(xi, 0.1, 0.05).tolist() == [False, True, True]
+    assert not far_from_truth(xi[1], 0.2, 0.05)
 
 
 @pytest.mark.parametrize("n", [65, 500, 5000])

@@ -8,7 +8,7 @@ import pytest
 from cello3d_ros.config import CloudConfig, Pipeline, TrainingConfig
 from cello3d_ros.covariance.features import FEATURES
 from cello3d_ros.covariance.methods import MethodSettings
-from cello3d_ros.covariance.model import constant_model
+from cello3d_ros.covariance.model import Model, constant_model
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.geometry.gaussian import kl
 from cello3d_ros.learning.comparison import (
@@ -177,6 +177,29 @@ def test_methods_from_a_dataset():
     assert report["n_pairs"] == 8
 
 
+def test_a_pair_far_from_every_example_is_also_judged_as_it_is_widened():
+    targets = dataclasses.replace(
+        some(2), features=np.array([[[0.5, 0.0, 0.0]], [[3.0, 0.0, 0.0]]], np.float32)
+    )
+    small, large = np.diag(SIZES**2), np.diag(SIZES[::-1] ** 2)
+    model = Model(
+        theta=np.eye(3)[:1],
+        mean=np.zeros(3),
+        scale=np.ones(3),
+        projections=np.array([[0.0], [-50.0]]),
+        covariances=np.array([small, large]),
+        rho_quantiles=np.array([1.0, 2.0]),
+    )
+    settings = MethodSettings(unknown_quantile=0.99)
+    found = from_dataset(model, targets, small, settings).covariances
+    np.testing.assert_array_equal(found["model_widened"][0], found["model"][0])
+    mean = (small + large) / 2
+    np.testing.assert_allclose(found["model"][1], small, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.diag(found["model_widened"][1]), np.fmax(np.diag(small), np.diag(mean))
+    )
+
+
 def test_flagged_pairs_are_left_out():
     targets, settings = some(), MethodSettings()
     model = constant_model(4.0 * np.eye(6), 3, shape="sandwich")
@@ -232,7 +255,7 @@ def test_a_dataset_without_the_models_shape_is_refused():
     settings = MethodSettings()
     absolute = from_dataset(constant_model(np.eye(6), 3), targets, np.eye(6), settings)
     methods = compare(absolute, targets, np.ones(8, np.bool_), settings)["methods"]
-    assert set(methods) == {"mean_covariance", "model", "constant"}
+    assert set(methods) == {"mean_covariance", "model", "model_widened", "constant"}
 
 
 def test_the_baseline_is_the_mean_that_the_model_was_trained_on(tmp_path):
@@ -256,7 +279,7 @@ def test_the_baseline_is_the_mean_that_the_model_was_trained_on(tmp_path):
         )
     np.testing.assert_allclose(mean_of([dataset]), 2.0 * np.eye(6))
     model = train(load_examples([dataset], ["a", "b"]), TrainingConfig(max_iterations=1)).model
-    assert seen_recordings(model) == {"a", "b"}
+    assert seen_recordings(model, {"b": set(), "c": {"x"}}) == {"b": "b"}
     np.testing.assert_allclose(training_mean(model), 2.0 * np.eye(6))
     np.testing.assert_allclose(training_mean(constant_model(np.diag([7.0] * 6), 3)), 7 * np.eye(6))
     with pytest.raises(DatasetError, match="does not keep it"):

@@ -23,7 +23,7 @@ from cello3d_ros.learning.loss import (
     median_rho,
     predicted,
 )
-from cello3d_ros.learning.training import train
+from cello3d_ros.learning.training import known_lost, train
 
 PAPER = TrainingConfig(
     features="descriptor", shape="none", theta="diagonal", mean_weight=0.0, regularization=1e-3
@@ -499,6 +499,46 @@ def test_examples_are_the_accepted_pairs_of_the_named_recordings(tmp_path: Path)
     record = one.read("a", 0, 1)
     assert 100 <= len(examples.xi[0]) <= 200
     assert set(examples.xi[0][:, 0]) <= set(record.xi[record.kept, 0])
+
+
+def test_lost_registrations_are_those_of_accepted_pairs_whatever_the_order(tmp_path: Path) -> None:
+    one, two = filled(tmp_path / "one", ("a",)), filled(tmp_path / "three", ("c",), seed=7)
+    examples = load_examples([one, two], ["a", "c"])
+    records = [
+        dataset.read(name, i, i + 1)
+        for dataset, name in ((one, "a"), (two, "c"))
+        for i in range(3)
+    ]
+    far = [
+        xi
+        for record in records
+        for xi in record.xi
+        if np.linalg.norm(xi[:3]) > 0.3 or np.linalg.norm(xi[3:]) > 0.15
+    ]
+    np.testing.assert_array_equal(examples.lost_xi, far)
+    np.testing.assert_array_equal(load_examples([two, one], ["c", "a"]).lost_xi, far)
+
+
+def test_the_limit_is_what_three_pairs_in_a_hundred_exceed() -> None:
+    examples = some(201)
+    sizes = np.arange(1, 202) * 1e-3
+    S = sizes[:, None, None] ** 2 * np.diag([1 / 3, 1 / 3, 1 / 3, 1, 1, 1])
+    lost_xi = np.random.default_rng(4).normal(size=(4000, 6)) * [2.0, 1, 1, 1, 1, 0.5]
+    examples = dataclasses.replace(examples, shapes={"sandwich": S}, lost_xi=lost_xi)
+    known = known_lost(examples)
+    assert known is not None
+    assert known.limit_m == pytest.approx(0.195)
+    assert np.diag(known.covariance) == pytest.approx([4, 1, 1, 1, 1, 0.25], rel=0.1)
+    assert known_lost(dataclasses.replace(examples, lost_xi=lost_xi[:29])) is None
+    assert known_lost(dataclasses.replace(examples, shapes={})) is None
+
+
+def test_the_papers_form_knows_nothing_of_other_minima() -> None:
+    lost_xi = np.random.default_rng(4).normal(size=(400, 6))
+    examples = dataclasses.replace(some(), lost_xi=lost_xi)
+    relative = dataclasses.replace(PAPER, shape="sandwich", max_iterations=2)
+    assert train(examples, dataclasses.replace(PAPER, max_iterations=2)).model.lost is None
+    assert train(examples, relative).model.lost is not None
 
 
 def test_datasets_of_different_settings_do_not_mix(tmp_path: Path) -> None:

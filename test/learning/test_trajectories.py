@@ -1,10 +1,13 @@
 """Odometry: chains of known covariances, and ICP between scans of a room."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import CloudConfig, SamplingConfig
+from cello3d_ros.covariance.lost import Lost
 from cello3d_ros.covariance.model import constant_model
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import GaussianPose, is_positive_definite
@@ -33,7 +36,11 @@ def test_a_chain_of_true_covariances_is_consistent():
     chain = compound_chain([GaussianPose(*step) for step in zip(motions, Y, strict=True)])
     np.testing.assert_allclose(chain.T, truth, atol=1e-12)
     runs = Runs(
-        log(inverse(truth) @ finals), np.tile(chain.Y, (n, 1, 1)), np.zeros(n, np.bool_), 0
+        log(inverse(truth) @ finals),
+        np.tile(chain.Y, (n, 1, 1)),
+        np.zeros(n, np.bool_),
+        np.zeros(n, np.bool_),
+        0,
     )
     report = consistency(runs)
     assert report["dm_6dof"] == pytest.approx(2.350, abs=0.05)
@@ -46,8 +53,9 @@ def test_distances_are_those_of_the_blocks():
     Y = np.tile(np.diag([4.0, 4, 4, 9, 9, 9]), (2, 1, 1))
     Y[:, 0, 3] = Y[:, 3, 0] = 3.0
     xi = np.array([[2.0, 0, 0, 3.0, 0, 0], [0, 40.0, 0, 0, 0, 0]])
-    report = consistency(Runs(xi, Y, np.array([False, True]), 3))
+    report = consistency(Runs(xi, Y, np.array([False, True]), np.array([True, True]), 3))
     assert (report["n_runs"], report["n_failed"], report["n_lost"]) == (2, 3, 1)
+    assert (report["n_told"], report["n_lost_told"]) == (2, 1)
     near = report["without_lost"]
     assert near["dm_translation"] == pytest.approx(1.0)
     assert near["dm_rotation"] == pytest.approx(1.0)
@@ -64,8 +72,10 @@ def test_a_chain_too_wide_for_the_fourth_order_stays_positive_definite():
 
 
 def test_without_any_run_there_are_no_distances():
-    report = consistency(Runs(np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros(0, np.bool_), 4))
-    assert report == {"n_runs": 0, "n_failed": 4, "n_lost": 0, "without_lost": {}}
+    none = np.zeros(0, np.bool_)
+    report = consistency(Runs(np.zeros((0, 6)), np.zeros((0, 6, 6)), none, none, 4))
+    counts = {"n_runs": 0, "n_failed": 4, "n_lost": 0, "n_told": 0, "n_lost_told": 0}
+    assert report == {**counts, "without_lost": {}}
 
 
 def test_length_is_that_of_the_path():
@@ -126,3 +136,17 @@ def test_lost_and_failed_runs_are_counted(walk, monkeypatch):
     runs = odometry_runs(*walk, a_model(0.01, variance=1e-3), 3)
     assert runs.n_failed == 1
     assert runs.lost.tolist() == [True, False]
+    assert not runs.told.any()
+
+
+def test_runs_are_told_lost_by_the_model_that_knows(walk):
+    V = np.diag([0.8, 0.5, 0.3, 0.1, 0.1, 0.1])
+    model = a_model(0.01, variance=1e-3)
+    runs = odometry_runs(*walk, model, 2, seed=3)
+    for limit_m, is_told in ((1e-9, True), (10.0, False)):
+        knowing = dataclasses.replace(model, lost=Lost(limit_m, V))
+        found = odometry_runs(*walk, knowing, 2, seed=3)
+        np.testing.assert_array_equal(found.xi, runs.xi)
+        assert found.told.tolist() == [is_told] * 2
+        assert not found.lost.any()
+        assert (np.linalg.eigvalsh(found.Y[0] - runs.Y[0])[-1] > 0.7) == is_told

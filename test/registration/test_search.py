@@ -6,7 +6,7 @@ import pytest
 from cello3d_ros.clouds.leaves import build_leaves, tree_order
 from cello3d_ros.registration.candidates import Places, make_candidates, make_room, nearest
 from cello3d_ros.registration.icp import _of_rank
-from cello3d_ros.registration.search import Ranked, search
+from cello3d_ros.registration.search import build_tree, search
 
 _PLANE = np.array([1.0, 1.0, 0.0])
 CASES = {
@@ -44,8 +44,7 @@ def plain(points, queries, k, cap2):
 def test_the_search_finds_what_sorting_all_distances_finds(case, k):
     rng = np.random.default_rng(21)
     points = CASES[case](rng)
-    points = points[tree_order(points)]
-    leaves = Ranked(build_leaves(points), np.arange(len(points)))
+    leaves = build_tree(points)
     queries = np.vstack([points[:200], points.mean(axis=0) + 2 * rng.normal(size=(101, 3))])
     queries[7] += 1e7
     distances2, indices = np.full((len(queries), k), np.inf), np.full((len(queries), k), -1)
@@ -54,7 +53,8 @@ def test_the_search_finds_what_sorting_all_distances_finds(case, k):
         distances2, indices = distances2[: len(queries)], indices[: len(queries)]
         n_found = search(queries, leaves, cap2, distances2, indices)
         expected2, expected = plain(points, queries, k, cap2)
-        np.testing.assert_array_equal(indices, expected)
+        found = np.where(indices >= 0, leaves.order[indices], -1)
+        np.testing.assert_array_equal(found, expected)
         np.testing.assert_array_equal(distances2, expected2)
         assert n_found == (expected >= 0).sum()
 
@@ -62,12 +62,11 @@ def test_the_search_finds_what_sorting_all_distances_finds(case, k):
 def test_of_equally_far_points_the_first_given_wins():
     rng = np.random.default_rng(24)
     given = rng.integers(0, 4, (500, 3)).astype(float)
-    order = tree_order(given)
-    leaves = Ranked(build_leaves(given[order]), order)
+    leaves = build_tree(given)
     queries = rng.integers(0, 4, (100, 3)) + rng.choice([0.0, 0.5], (100, 3))
     distances2, indices = np.empty((100, 3)), np.full((100, 3), -1)
     search(queries, leaves, np.inf, distances2, indices)
-    np.testing.assert_array_equal(order[indices], plain(given, queries, 3, np.inf)[1])
+    np.testing.assert_array_equal(leaves.order[indices], plain(given, queries, 3, np.inf)[1])
 
 
 def assert_candidates_are_exact(points, queries, k, caps, rng, **room):

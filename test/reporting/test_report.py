@@ -98,6 +98,16 @@ def walk(tmp_path: Path, room: tuple[np.ndarray, np.ndarray]) -> Path:
 
 
 @pytest.mark.usefixtures("plotly")
+def test_a_recording_that_the_model_was_trained_on_is_said_to_be(tmp_path: Path) -> None:
+    report = an_evaluation()
+    for is_seen in (True, False):
+        report["recordings"]["walk"]["trained_on"] = is_seen
+        assert make(tmp_path, report) == 0
+        page = (tmp_path / "r.html").read_text()
+        assert ("walk (2 pairs), which the model was trained" in page) == is_seen
+
+
+@pytest.mark.usefixtures("plotly")
 def test_the_page_holds_the_figures_and_fetches_nothing(tmp_path: Path) -> None:
     assert make(tmp_path, an_evaluation()) == 0
     page = (tmp_path / "r.html").read_text()

@@ -33,15 +33,16 @@ def table(title: str) -> dict[str, str]:
     return {key: row[-1] for row in cells for key in re.findall(r"`([^`]+)`", row[0])}
 
 
-def answered(statistics: Statistics, C: np.ndarray, is_unknown: bool = False, **settings) -> None:
+def an_estimate(C: np.ndarray, **flags: bool) -> Estimate:
+    registration = Registration(se3.exp([1.0, 0, 0, 0, 0, 0]), 7, True, "", 0.02, 900)
+    return Estimate(registration, 0.8, C, 0.5, 4.0, "model", **flags)
+
+
+def answered(statistics: Statistics, C: np.ndarray, **settings) -> None:
     config = NodeConfig(max_failures=3, **settings)
-    found = Estimate(
-        Registration(se3.exp([1.0, 0, 0, 0, 0, 0]), 7, True, "", 0.02, 900),
-        *(0.8, C, 0.5, 4.0, "model"),
-        is_unknown,
-    )
+    found = an_estimate(C)
     answer = Answer(2, 1, found, np.eye(4), C, offset=np.zeros(6))
-    statistics.answer(answer, C, judged(C, is_unknown, config), 0.0, 3)
+    statistics.answer(answer, C, judged(C, found, config), 0.0, 3)
 
 
 def said(statistics: Statistics) -> tuple[int, str, dict[str, str]]:
@@ -141,10 +142,20 @@ def test_three_sigma_along_the_weakest_axis_are_judged(sigma_m, is_unknown, leve
     R = se3.exp([0, 0, 0, 0.3, 0.4, 1.0])[:3, :3]
     C = 1e-6 * np.eye(6)
     C[:3, :3] = R @ np.diag([sigma_m**2, 1e-6, 1e-6]) @ R.T
-    verdict = judged(C, is_unknown, CONFIG)
+    verdict = judged(C, an_estimate(C, is_unknown=is_unknown), CONFIG)
     assert verdict.level == level
     assert [word for word in words if word in verdict.sentence] == words
     assert verdict.sentence.count(";") == len(words) - 1
+
+
+def test_a_registration_that_is_probably_lost_is_told_of() -> None:
+    C = 1e-6 * np.eye(6)
+    verdict = judged(C, an_estimate(C, is_lost=True, is_unknown=True), CONFIG)
+    assert verdict.level == WARN
+    assert "probably lost" in verdict.sentence
+    assert "out of distribution" in verdict.sentence
+    wide = 0.8 * np.eye(6)
+    assert judged(wide, an_estimate(wide, is_lost=True), CONFIG).level == ERROR
 
 
 def test_numbers_are_those_of_the_covariance(statistics) -> None:

@@ -1,5 +1,6 @@
 """Every covariance mode on the node's own process: what its consumers would say."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,8 +11,8 @@ pytest.importorskip("rclpy")
 from consumer_rules import of_pose, of_twist
 
 from cello3d_ros.config import NodeConfig
-from cello3d_ros.covariance.model import load_model, shipped_model_path
-from cello3d_ros.covariance.novelty import rho_limit
+from cello3d_ros.covariance.lost import Lost
+from cello3d_ros.covariance.model import load_model, save_model, shipped_model_path
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import to_fixed_axes
 from cello3d_ros.recordings.recording import Scan
@@ -154,7 +155,7 @@ def test_a_pair_unlike_all_examples_warns_and_is_widened(tmp_path, domain_id, re
         played(tmp_path / name, domain_id, recording, inflate_unknown=value, **settings)
         for name, value in (("kept", "false"), ("widened", "true"))
     )
-    limit = rho_limit(load_model(shipped_model_path()), 0.0)
+    limit = load_model(shipped_model_path()).rho_quantiles[0]
     n_unknown = 0
     for stamp_ns, status in widened.status.items():
         if status["last_event"] != "answered":
@@ -168,7 +169,36 @@ def test_a_pair_unlike_all_examples_warns_and_is_widened(tmp_path, domain_id, re
         wide, plain = widened.relative[stamp_ns].C, kept.relative[stamp_ns].C
         assert np.linalg.eigvalsh(wide - plain)[0] > -1e-12
     assert n_unknown > 0
-    assert not math.isinf(limit)
+
+
+@pytest.mark.parametrize("mode", ["cello3d", "hessian"])
+def test_a_registration_that_is_probably_lost_is_told_of_and_wide(
+    tmp_path, domain_id, recording, by_mode, mode
+) -> None:
+    """A model that takes every sandwich for a lost registration's."""
+    V = np.diag([0.8, 0.5, 0.3, 0.09, 0.03, 0.12])
+    suspicious = dataclasses.replace(load_model(shipped_model_path()), lost=Lost(1e-6, V))
+    save_model(suspicious, tmp_path / "model.npz")
+    found = played(
+        *(tmp_path, domain_id, recording),
+        model=str(tmp_path / "model.npz"),
+        covariance_mode=mode,
+        inflate_unknown="false",
+    )
+    answered = [status for status in found.status.values() if "probably_lost" in status]
+    assert answered
+    for status in answered:
+        assert status["probably_lost"] == "true"
+        assert "probably lost" in status["message"]
+        assert status["level"] == ("2" if mode == "cello3d" else "1")
+    for stamp_ns, pose in found.relative.items():
+        plain = by_mode[mode].relative[stamp_ns].C
+        assert (np.linalg.eigvalsh(pose.C - plain)[-1] > 0.7) == (mode == "cello3d")
+    assert {
+        status["probably_lost"]
+        for status in by_mode[mode].status.values()
+        if "probably_lost" in status
+    } == {"false"}
 
 
 def test_sizes_beyond_the_thresholds_warn_and_are_errors_but_are_published(

@@ -157,6 +157,43 @@ def test_after_max_failures_the_last_scan_is_the_reference_of_a_new_chain(tracke
     np.testing.assert_allclose(answer.Y_chain, WIDE, atol=1e-12)
 
 
+def test_a_bad_first_scan_is_given_up_for_two_that_fit_each_other(asked) -> None:
+    tracker = tracker_with(max_failures=5)
+    tracker.step(0, POINTS, Place(POSES[0]))
+    asked[1].extend([NoOverlapError("nothing in common"), NoOverlapError("nothing in common")])
+    with pytest.raises(NoOverlapError):
+        tracker.step(S, POINTS, Place(POSES[1]))
+    answer = tracker.step(2 * S, POINTS, Place(POSES[3]))
+    assert (answer.reference_ns, tracker.n_restarts) == (S, 1)
+    np.testing.assert_allclose(asked[0][-1], se3.inverse(POSES[1]) @ POSES[3], atol=1e-12)
+    np.testing.assert_allclose(answer.T_odom_read, POSES[3], atol=1e-12)
+    np.testing.assert_allclose(answer.Y_chain, WIDE, atol=1e-12)
+    answer = tracker.step(3 * S, POINTS, Place(POSES[4]))
+    assert (answer.reference_ns, tracker.n_restarts) == (2 * S, 1)
+
+
+def test_a_good_first_scan_outlives_a_bad_second(asked) -> None:
+    tracker = tracker_with(max_failures=5)
+    tracker.step(0, POINTS, Place(POSES[0]))
+    asked[1].append(NoOverlapError("nothing in common"))
+    with pytest.raises(NoOverlapError):
+        tracker.step(S, POINTS, Place(POSES[1]))
+    assert tracker.step(2 * S, POINTS, Place(POSES[2])).reference_ns == 0
+    assert tracker.n_restarts == 0
+
+
+def test_a_reference_that_has_fitted_stays_until_max_failures(asked) -> None:
+    tracker = tracker_with(max_failures=5)
+    for i in range(2):
+        tracker.step(i * S, POINTS, Place(POSES[i]))
+    asked[1].extend([NoOverlapError("nothing in common")] * 3)
+    for i in range(2, 5):
+        with pytest.raises(NoOverlapError):
+            tracker.step(i * S, POINTS, Place(POSES[i]))
+    assert len(asked[0]) == 4  # none of the three was tried against another
+    assert tracker.step(5 * S, POINTS, Place(POSES[5])).reference_ns == S
+
+
 def test_failures_that_are_not_in_a_row_do_not_add_up(tracker, asked) -> None:
     tracker.step(0, POINTS, Place(POSES[0]))
     for i in range(1, 8, 2):
