@@ -28,14 +28,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cello3d_ros.clouds.leaves import (
-    Indices,
-    boxes_near,
-    boxes_near_box,
-    build_leaves,
-    lowest_bit,
-    tree_order,
-)
+from cello3d_ros.clouds.lanes import boxes_near, boxes_near_box, lowest_bit
+from cello3d_ros.clouds.leaves import Indices, build_leaves, tree_order
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.lanes import lane_keys, least_key_above
 
@@ -64,7 +58,7 @@ class Tree(NamedTuple):
 def build_tree(points: Array) -> Tree:
     """Build the tree of (N, 3) points, N > 0."""
     order = tree_order(points)
-    points = points[order]
+    points = points.take(order, axis=0)
     lanes, boxes, children = build_leaves(points)
     scale = 2.0 ** -math.frexp(float(np.abs(points).max()))[1]
     return Tree(order, points, (lanes * scale).astype(np.float32), scale, boxes, children)
