@@ -15,20 +15,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sampling import in_order
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from cello3d_ros.clouds.leaves import tree_order
-from cello3d_ros.clouds.neighbors import build_tree
-from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import exp, transform
 from cello3d_ros.registration import icp as kernels
 from cello3d_ros.registration.candidates import Places, make_candidates, nearest
 from cello3d_ros.registration.icp import icp, register_many
-from cello3d_ros.registration.search import build_tree as build_search_tree
-from cello3d_ros.registration.search import search
+from cello3d_ros.registration.search import build_tree, search
 
 _CONFIG = IcpConfig()
 
@@ -67,7 +65,7 @@ def simulate() -> dict[str, Any]:
 def measure(case: dict[str, Any], n: int) -> dict[str, Any]:
     read, ref, normals = case["reading_points"], case["ref_points"], case["ref_normals"]
     starts = np.resize(case["T0"], (n, 4, 4))
-    clouds = [Cloud(p, normals, p[:, 0], p[:, 0], build_tree(p)) for p in (read, ref)]
+    clouds = in_order(read, np.zeros_like(read)), in_order(ref, normals)  # as prepared ones are
     whole = IcpConfig(n_reading_points=len(read), n_reference_points=len(ref))
     seeds = [[i] for i in range(n)]
 
@@ -118,7 +116,7 @@ def timed(work: Callable[[], Any]) -> tuple[float, Any]:
 def profile(read: Any, ref: Any, normals: Any, T: Any, n_runs: int = 50) -> dict[str, float]:
     """Time the three parts of an iteration where ICP ends, the neighbours known."""
     moved = np.ascontiguousarray(transform(T, read[tree_order(read)]))
-    leaves = build_search_tree(ref)
+    leaves = build_tree(ref)
     ref, normals = leaves.points, np.ascontiguousarray(normals[leaves.order])
     k = _CONFIG.n_neighbors
     d2, indices = np.empty((len(read), k)), np.full((len(read), k), -1)

@@ -36,7 +36,7 @@ def _lowest_bit(_: Any, mask: Any) -> Any:
 
 def _points_near(_: Any, points: Any, leaf: Any, x: Any, y: Any, z: Any, far2: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = _data(context, builder, signature, arguments, 0)
+        data = data_of(context, builder, signature, arguments, 0)
         return _mask(builder, _from_points(builder, data, *arguments[1:5]), arguments[5])
 
     return _I8(points, _I8, _F8, _F8, _F8, _F8), codegen
@@ -46,9 +46,9 @@ def _distances_of(
     _: Any, points: Any, leaf: Any, x: Any, y: Any, z: Any, most2: Any, rows: Any, row: Any
 ) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = _data(context, builder, signature, arguments, 0)
+        data = data_of(context, builder, signature, arguments, 0)
         d2 = _from_points(builder, data, *arguments[1:5])
-        out = _data(context, builder, signature, arguments, 6)
+        out = data_of(context, builder, signature, arguments, 6)
         builder.store(d2, _pointer(builder, out, arguments[7], 1, 0), align=8)
         return builder.ctpop(_mask(builder, d2, arguments[5]))
 
@@ -57,7 +57,7 @@ def _distances_of(
 
 def _count_row(_: Any, rows: Any, row: Any, most: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        values = _load(builder, _data(context, builder, signature, arguments, 0), arguments[1])
+        values = _load(builder, data_of(context, builder, signature, arguments, 0), arguments[1])
         return builder.ctpop(_mask(builder, values, arguments[2]))
 
     return _I8(rows, _I8, _F8), codegen
@@ -65,8 +65,8 @@ def _count_row(_: Any, rows: Any, row: Any, most: Any) -> Any:
 
 def _least_above(_: Any, rows: Any, n_rows: Any, floor: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = _data(context, builder, signature, arguments, 0)
-        floors, nothing = _splat(builder, arguments[2]), ir.Constant(_DOUBLES, [math.inf] * _ROW)
+        data = data_of(context, builder, signature, arguments, 0)
+        floors, nothing = splat(builder, arguments[2]), ir.Constant(_DOUBLES, [math.inf] * _ROW)
         least = _tools.alloca_once_value(builder, nothing)
         with _tools.for_range(builder, arguments[1]) as loop:
             values, best = _load(builder, data, loop.index), builder.load(least)
@@ -84,8 +84,8 @@ def _least_above(_: Any, rows: Any, n_rows: Any, floor: Any) -> Any:
 
 def _lanes_of(_: Any, rows: Any, row: Any, value: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        values = _load(builder, _data(context, builder, signature, arguments, 0), arguments[1])
-        same = builder.fcmp_ordered("==", values, _splat(builder, arguments[2]))
+        values = _load(builder, data_of(context, builder, signature, arguments, 0), arguments[1])
+        same = builder.fcmp_ordered("==", values, splat(builder, arguments[2]))
         return builder.zext(builder.bitcast(same, ir.IntType(_ROW)), _I64)
 
     return _I8(rows, _I8, _F8), codegen
@@ -104,7 +104,7 @@ def _boxes_near_box(
     far2: Any,
 ) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = _data(context, builder, signature, arguments, 0)
+        data = data_of(context, builder, signature, arguments, 0)
         d2 = _from_boxes(builder, data, arguments[1], arguments[2:5], arguments[5:8])
         return _mask(builder, d2, arguments[8])
 
@@ -113,14 +113,14 @@ def _boxes_near_box(
 
 def _boxes_near(_: Any, boxes: Any, node: Any, x: Any, y: Any, z: Any, far2: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = _data(context, builder, signature, arguments, 0)
+        data = data_of(context, builder, signature, arguments, 0)
         d2 = _from_boxes(builder, data, arguments[1], arguments[2:5], arguments[2:5])
         return _mask(builder, d2, arguments[5])
 
     return _I8(boxes, _I8, _F8, _F8, _F8, _F8), codegen
 
 
-def _data(context: Any, builder: Any, signature: Any, arguments: Any, i: int) -> Any:
+def data_of(context: Any, builder: Any, signature: Any, arguments: Any, i: int) -> Any:
     """Return the pointer to the elements of an array argument."""
     return context.make_array(signature.args[i])(context, builder, arguments[i]).data
 
@@ -137,9 +137,9 @@ def _load(builder: Any, data: Any, block: Any, n_rows: int = 1, row: int = 0) ->
     return builder.load(_pointer(builder, data, block, n_rows, row), align=8)
 
 
-def _splat(builder: Any, value: Any) -> Any:
+def splat(builder: Any, value: Any, vector: Any = _DOUBLES) -> Any:
     """Return a vector whose lanes all have one value."""
-    nothing = ir.Constant(_DOUBLES, ir.Undefined)
+    nothing = ir.Constant(vector, ir.Undefined)
     one = builder.insert_element(nothing, value, ir.Constant(_I32, 0))
     return builder.shuffle_vector(one, nothing, ir.Constant(_INTS, [0] * _ROW))
 
@@ -157,7 +157,7 @@ def _squares(builder: Any, dx: Any, dy: Any, dz: Any) -> Any:
 def _from_points(builder: Any, points: Any, leaf: Any, *query: Any) -> Any:
     """Return the squared distances of a leaf's points from the query."""
     steps = [
-        builder.fsub(_load(builder, points, leaf, 3, a), _splat(builder, query[a]))
+        builder.fsub(_load(builder, points, leaf, 3, a), splat(builder, query[a]))
         for a in range(3)
     ]
     return _squares(builder, *steps)
@@ -167,8 +167,8 @@ def _from_boxes(builder: Any, boxes: Any, node: Any, low: Any, high: Any) -> Any
     """Return the squared distances of a node's boxes from the box between ``low`` and ``high``."""
     steps = []
     for a in range(3):
-        after = builder.fsub(_load(builder, boxes, node, 6, a), _splat(builder, high[a]))
-        before = builder.fsub(_splat(builder, low[a]), _load(builder, boxes, node, 6, 3 + a))
+        after = builder.fsub(_load(builder, boxes, node, 6, a), splat(builder, high[a]))
+        before = builder.fsub(splat(builder, low[a]), _load(builder, boxes, node, 6, 3 + a))
         nothing = ir.Constant(_DOUBLES, [0.0] * _ROW)
         steps.append(_larger(builder, _larger(builder, after, before), nothing))
     return _squares(builder, *steps)
@@ -176,7 +176,7 @@ def _from_boxes(builder: Any, boxes: Any, node: Any, low: Any, high: Any) -> Any
 
 def _mask(builder: Any, values: Any, most: Any) -> Any:
     """Return the mask of the lanes that are at most ``most``."""
-    inside = builder.fcmp_ordered("<=", values, _splat(builder, most))
+    inside = builder.fcmp_ordered("<=", values, splat(builder, most))
     return builder.zext(builder.bitcast(inside, ir.IntType(_ROW)), _I64)
 
 

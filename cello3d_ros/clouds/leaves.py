@@ -20,10 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cello3d_ros.clouds.lanes import boxes_near as boxes_near
-from cello3d_ros.clouds.lanes import boxes_near_box as boxes_near_box
-from cello3d_ros.clouds.lanes import lowest_bit as lowest_bit
-from cello3d_ros.clouds.lanes import points_near as points_near
+from cello3d_ros.clouds.lanes import boxes_near_box, lowest_bit
 from cello3d_ros.geometry.se3 import Array
 
 Indices = NDArray[np.int64]

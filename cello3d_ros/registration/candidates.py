@@ -34,7 +34,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cello3d_ros.clouds.leaves import Indices, lowest_bit
+from cello3d_ros.clouds.lanes import lowest_bit
+from cello3d_ros.clouds.leaves import Indices
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.lanes import BLOCKS, nearest_lanes, prefetch
 

@@ -96,9 +96,8 @@ def register(
     """Register random subsamples of two clouds, drawn anew: they are part of ICP's noise."""
     read = subsample(len(reading.points), config.n_reading_points, rng)
     ref = subsample(len(reference.points), config.n_reference_points, rng)
-    return _icp_in_order(
-        reading.points[read], reference.points[ref], reference.normals[ref], T_init, config
-    )
+    points, normals = (rows.take(ref, axis=0) for rows in (reference.points, reference.normals))
+    return _icp_in_order(reading.points.take(read, axis=0), points, normals, T_init, config)
 
 
 def register_many(
@@ -131,7 +130,7 @@ def register_many(
             make_room(candidates)
             read = subsample(len(reading.points), config.n_reading_points, rng)
             index = Places(candidates, np.zeros(len(read), np.int32))
-            pair = _Pair(reading.points[read], points, reference.normals, index, mean)
+            pair = _Pair(reading.points.take(read, axis=0), points, reference.normals, index, mean)
             return _register_pair(pair, T_inits[i], config)
         finally:
             rooms.put(candidates)
@@ -159,7 +158,7 @@ def _icp_in_order(
         return _too_few(T_init)
     mean = reference.mean(axis=0)
     tree = build_tree(reference - mean)
-    pair = _Pair(reading, tree.points, normals[tree.order], tree, mean)
+    pair = _Pair(reading, tree.points, normals.take(tree.order, axis=0), tree, mean)
     return _register_pair(pair, T_init, config)
 
 

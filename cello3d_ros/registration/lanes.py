@@ -23,6 +23,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from cello3d_ros.clouds.lanes import data_of, splat
+
 _tools: Any = cgutils
 
 BLOCKS = 4  # of a list, at most: 64 lanes, as many as six bits can number
@@ -34,7 +36,7 @@ _MOST = 0x7FFFFFFF
 
 def _prefetch(_: Any, lanes: Any, first: Any, n_blocks: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = _data(context, builder, signature, arguments, 0)
+        data = data_of(context, builder, signature, arguments, 0)
         pointer = ir.IntType(8).as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [pointer, _I32, _I32, _I32])
         prefetch = _tools.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
@@ -61,9 +63,9 @@ def _nearest_lanes(
     keys: Any,
 ) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = _data(context, builder, signature, arguments, 0)
-        out = _data(context, builder, signature, arguments, 8)
-        query = [_splat(builder, value, _FLOATS) for value in arguments[3:6]]
+        data = data_of(context, builder, signature, arguments, 0)
+        out = data_of(context, builder, signature, arguments, 8)
+        query = [splat(builder, value, _FLOATS) for value in arguments[3:6]]
         blocks = _blocks(builder, arguments[1], arguments[2])
         all_keys = [
             _keys(builder, data, block, query, 4, 6, ir.Constant(_I32, _ROW * g))
@@ -82,9 +84,9 @@ def _nearest_lanes(
 
 def _lane_keys(_: Any, lanes: Any, leaf: Any, x: Any, y: Any, z: Any, row: Any, keys: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = _data(context, builder, signature, arguments, 0)
-        out = _data(context, builder, signature, arguments, 6)
-        query = [_splat(builder, value, _FLOATS) for value in arguments[2:5]]
+        data = data_of(context, builder, signature, arguments, 0)
+        out = data_of(context, builder, signature, arguments, 6)
+        query = [splat(builder, value, _FLOATS) for value in arguments[2:5]]
         first = builder.trunc(builder.mul(arguments[5], ir.Constant(_I64, _ROW)), _I32)
         values = _keys(builder, data, arguments[1], query, 3, 10, first)
         pointer = _row(builder, out, arguments[5], 0, 1)
@@ -97,8 +99,8 @@ def _lane_keys(_: Any, lanes: Any, leaf: Any, x: Any, y: Any, z: Any, row: Any, 
 
 def _least_key_above(_: Any, keys: Any, n_rows: Any, key: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = _data(context, builder, signature, arguments, 0)
-        floor = _splat(builder, arguments[2], _INTS)
+        data = data_of(context, builder, signature, arguments, 0)
+        floor = splat(builder, arguments[2], _INTS)
         least = _tools.alloca_once(builder, _INTS)
         builder.store(ir.Constant(_INTS, [_MOST] * _ROW), least)
         with _tools.for_range(builder, arguments[1]) as loop:
@@ -108,18 +110,6 @@ def _least_key_above(_: Any, keys: Any, n_rows: Any, key: Any) -> Any:
         return _least_lane(builder, builder.load(least))
 
     return types.int32(keys, types.int64, types.int32), codegen
-
-
-def _data(context: Any, builder: Any, signature: Any, arguments: Any, i: int) -> Any:
-    """Return the pointer to the elements of an array argument."""
-    return context.make_array(signature.args[i])(context, builder, arguments[i]).data
-
-
-def _splat(builder: Any, value: Any, vector: Any) -> Any:
-    """Return a vector whose lanes all have one value."""
-    nothing = ir.Constant(vector, ir.Undefined)
-    one = builder.insert_element(nothing, value, ir.Constant(_I32, 0))
-    return builder.shuffle_vector(one, nothing, ir.Constant(_INTS, [0] * _ROW))
 
 
 def _blocks(builder: Any, first: Any, n_blocks: Any) -> list[Any]:
@@ -151,12 +141,12 @@ def _keys(
         d2 = builder.fmul(d, d) if d2 is None else builder.fadd(d2, builder.fmul(d, d))
     cleared = builder.and_(builder.bitcast(d2, _INTS), ir.Constant(_INTS, [-1 << n_bits] * _ROW))
     lanes = ir.Constant(_INTS, list(range(_ROW)))
-    return builder.or_(cleared, builder.or_(_splat(builder, first, _INTS), lanes))
+    return builder.or_(cleared, builder.or_(splat(builder, first, _INTS), lanes))
 
 
 def _least_above(builder: Any, all_keys: list[Any], key: Any) -> Any:
     """Return the least of all keys that are greater than ``key``."""
-    floor, least = _splat(builder, key, _INTS), ir.Constant(_INTS, [_MOST] * _ROW)
+    floor, least = splat(builder, key, _INTS), ir.Constant(_INTS, [_MOST] * _ROW)
     for keys in all_keys:
         least = _lesser_above(builder, keys, floor, least)
     return _least_lane(builder, least)
@@ -187,7 +177,7 @@ def _too_close(builder: Any, key: Any, slack: Any) -> Any:
 
 def _mask_between(builder: Any, all_keys: list[Any], above: Any, most: Any) -> Any:
     """Return the mask of the lanes whose keys are greater than ``above``, at most ``most``."""
-    floor, top = _splat(builder, above, _INTS), _splat(builder, most, _INTS)
+    floor, top = splat(builder, above, _INTS), splat(builder, most, _INTS)
     mask = ir.Constant(_I64, 0)
     for g, keys in enumerate(all_keys):
         inside = builder.and_(

@@ -28,14 +28,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cello3d_ros.clouds.leaves import (
-    Indices,
-    boxes_near,
-    boxes_near_box,
-    build_leaves,
-    lowest_bit,
-    tree_order,
-)
+from cello3d_ros.clouds.lanes import boxes_near, lowest_bit
+from cello3d_ros.clouds.leaves import Indices, Leaves, build_leaves, leaves_near, tree_order
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.lanes import lane_keys, least_key_above
 
@@ -50,24 +44,23 @@ class Tree(NamedTuple):
     """N points and what finds the nearest of them.
 
     order: (N,), the tree's order of the points as they were given; points: (N, 3) in that order;
-    lanes: (L, 3, 16), the leaves times ``scale``; boxes, children: as in leaves.py.
+    lanes: (L, 3, 16), its leaves times ``scale``.
     """
 
     order: Indices
     points: Array
     lanes: NDArray[np.float32]
     scale: float
-    boxes: Array
-    children: Indices
+    leaves: Leaves
 
 
 def build_tree(points: Array) -> Tree:
     """Build the tree of (N, 3) points, N > 0."""
     order = tree_order(points)
-    points = points[order]
-    lanes, boxes, children = build_leaves(points)
+    points = points.take(order, axis=0)
+    leaves = build_leaves(points)
     scale = 2.0 ** -math.frexp(float(np.abs(points).max()))[1]
-    return Tree(order, points, (lanes * scale).astype(np.float32), scale, boxes, children)
+    return Tree(order, points, (leaves.points * scale).astype(np.float32), scale, leaves)
 
 
 @njit(cache=True, nogil=True)
@@ -81,12 +74,12 @@ def search(moved: Array, tree: Tree, cap2: float, distances2: Array, indices: In
     their leaves together: a leaf farther from the box around them than the farthest bound of them
     all concerns none of them.  (Functions that take arrays would cost more here than they do.)
     """
-    order, points, lanes, scale, boxes, children = tree
+    order, points, lanes, scale, leaves = tree
     n, k = indices.shape
     n_leaves = len(lanes)
     near = np.empty(n_leaves, np.int64)  # the leaves near eight queries, and their boxes
     near_boxes = np.empty((n_leaves // 16 + 1, 6, 16))
-    stack = np.empty(256, np.int64)
+    stack, box = np.empty(256, np.int64), np.empty(6)
     bounds2 = np.empty(_GROUP)
     keys, rows = np.empty((_ROWS, 16), np.int32), np.empty(_ROWS, np.int64)
     last = np.arange(k)  # some k points, to bound the distance of queries that have no bound
@@ -94,13 +87,13 @@ def search(moved: Array, tree: Tree, cap2: float, distances2: Array, indices: In
     total = 0
     for start in range(0, n, _GROUP):
         stop = min(start + _GROUP, n)
-        x0 = y0 = z0 = np.inf
-        x1 = y1 = z1 = -np.inf
+        for a in range(3):
+            box[a], box[3 + a] = np.inf, -np.inf
         far2 = 0.0
         for i in range(start, stop):
             x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
-            x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
-            x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
+            for a in range(3):
+                box[a], box[3 + a] = min(box[a], moved[i, a]), max(box[3 + a], moved[i, a])
             has_bound = indices[i, k - 1] >= 0
             bound2 = cap2
             if has_bound or (cap2 == _FAR2 and k <= len(points)):
@@ -111,28 +104,8 @@ def search(moved: Array, tree: Tree, cap2: float, distances2: Array, indices: In
                     bound2 = max(bound2, dx * dx + dy * dy + dz * dz)
             bounds2[i - start] = min(bound2, cap2)
             far2 = max(far2, bounds2[i - start])
-        n_near, top = 0, 1
-        stack[0] = len(boxes) - 1
-        while top > 0:
-            top -= 1
-            node = stack[top]
-            mask = boxes_near_box(boxes, node, x0, y0, z0, x1, y1, z1, far2)
-            while mask:
-                lane = lowest_bit(mask)
-                mask &= mask - 1
-                child = children[node] + lane
-                if child >= n_leaves:
-                    stack[top] = child - n_leaves
-                    top += 1
-                    continue
-                near[n_near] = child
-                for a in range(6):
-                    near_boxes[n_near >> 4, a, n_near & 15] = boxes[node, a, lane]
-                n_near += 1
+        n_near = leaves_near(leaves, box, far2, stack, near, near_boxes)
         n_blocks = (n_near + 15) >> 4
-        for lane in range(n_near, 16 * n_blocks):
-            for a in range(6):
-                near_boxes[lane >> 4, a, lane & 15] = np.inf
         for i in range(start, stop):
             x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
             bound2 = bounds2[i - start]

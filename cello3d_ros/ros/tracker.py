@@ -196,7 +196,7 @@ class Tracker:
 
     def _answer(self, reading: Frame, reference: Link, rng: np.random.Generator) -> Answer:
         T_init, guess = self._guess(reading, reference)
-        clouds = reading.cloud, reference.frame.cloud
+        clouds = reading.cloud, self._shaped(reference.frame).cloud  # a rival has none yet
         external: External | None = None
         if guess == EXTERNAL:
             limit = self.config.max_external_offset

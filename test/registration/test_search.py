@@ -39,24 +39,36 @@ def plain(points, queries, k, cap2):
     return distances2, indices
 
 
+def assert_tree_is_exact(points, queries, k, caps, move):
+    tree = build_tree(points)
+    distances2, indices = np.full((len(queries), k), np.inf), np.full((len(queries), k), -1)
+    for cap2 in caps:  # with the last neighbours as bounds
+        n_found = search(queries, tree, cap2, distances2, indices)
+        expected2, expected = plain(points, queries, k, cap2)
+        np.testing.assert_array_equal(np.where(indices < 0, -1, tree.order[indices]), expected)
+        np.testing.assert_array_equal(distances2, expected2)
+        assert n_found == (expected >= 0).sum()
+        queries = move(queries)
+
+
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("k", [1, 3, 5])
+@pytest.mark.parametrize("k", [1, 3, 5, 20])
 def test_the_search_finds_what_sorting_all_distances_finds(case, k):
     rng = np.random.default_rng(21)
     points = CASES[case](rng)
-    leaves = build_tree(points)
     queries = np.vstack([points[:200], points.mean(axis=0) + 2 * rng.normal(size=(101, 3))])
     queries[7] += 1e7
-    distances2, indices = np.full((len(queries), k), np.inf), np.full((len(queries), k), -1)
-    for cap2 in (np.inf, np.inf, 0.5, 0.05, 0.0):  # with the last neighbours as bounds
-        queries = queries + 0.05 * rng.normal(size=3) if cap2 > 0.0 else points[:301].copy()
-        distances2, indices = distances2[: len(queries)], indices[: len(queries)]
-        n_found = search(queries, leaves, cap2, distances2, indices)
-        expected2, expected = plain(points, queries, k, cap2)
-        found = np.where(indices >= 0, leaves.order[indices], -1)
-        np.testing.assert_array_equal(found, expected)
-        np.testing.assert_array_equal(distances2, expected2)
-        assert n_found == (expected >= 0).sum()
+    queries[8] = 1e9, -1e25, 3.0  # beyond float32 once it is squared
+    caps = (np.inf, np.inf, 0.5, 0.05, 0.0)
+    assert_tree_is_exact(points, queries, k, caps, lambda q: q + 0.05 * rng.normal(size=3))
+    assert_tree_is_exact(points, points[:301], k, (np.inf, 0.0), lambda q: q)
+
+
+@pytest.mark.parametrize("scale", [1e-120, 1e-30, 1.0, 1e30, 1e140])
+def test_the_search_does_not_depend_on_the_unit_of_length(scale):
+    rng = np.random.default_rng(28)
+    points, queries = scale * rng.normal(size=(700, 3)), scale * rng.normal(size=(90, 3))
+    assert_tree_is_exact(points, queries, 3, (np.inf, 0.5 * scale * scale), lambda q: q)
 
 
 def test_of_equally_far_points_the_first_given_wins():
@@ -101,8 +113,8 @@ def test_candidates_are_what_sorting_all_distances_finds(case, k):
     assert_candidates_are_exact(points, queries, k, (np.inf, 0.5, 0.05, 0.0), rng)
 
 
-def test_candidates_are_exact_where_float32_cannot_tell():
-    """Points on a sphere, their radii equal but for what double precision holds."""
+def test_both_are_exact_where_float32_cannot_tell():
+    """Points on a sphere, radii equal but for what double precision holds, hence many leaves."""
     rng = np.random.default_rng(26)
     points = rng.normal(size=(3000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
@@ -111,6 +123,7 @@ def test_candidates_are_exact_where_float32_cannot_tell():
     points = np.vstack([points * (1.0 + 1e-9 * rng.random((3000, 1))), 0.05 * ring])
     queries = np.vstack([1e-6 * rng.normal(size=(100, 3)), 0.05 * rng.normal(size=(200, 3))])
     assert_candidates_are_exact(points, queries, 3, (np.inf, 1.1), rng)
+    assert_tree_is_exact(points, queries, 3, (np.inf, 1.1), lambda q: q + 1e-7)
 
 
 def test_candidates_are_exact_when_room_is_short_and_start_over():

@@ -125,6 +125,23 @@ def test_answers_are_the_same_whether_it_is_worked_ahead_or_not(pairing_name, mo
     assert n_answers >= len(SMALL_STEPS) - 1
 
 
+@pytest.mark.parametrize("pairing_name", ["consecutive", "keyframe"])
+def test_two_scans_that_fit_each_other_are_registered_though_neither_was_a_reference(
+    pairing_name,
+) -> None:
+    node = NodeConfig(pairing=pairing_name)
+    tracker = Tracker(load_model(shipped_model_path()), Config(node=node), node)
+    far = POINTS + np.array([60.0, 0.0, 0.0])
+    scans = [se3.transform(se3.inverse(T), 2.0 * POINTS) for T in SMALL_STEPS]
+    assert tracker.step(0, far, Place(SMALL_STEPS[0])) is None
+    tracker.finish()
+    with pytest.raises(NoOverlapError):
+        tracker.step(S, scans[1], Place(SMALL_STEPS[1]))
+    tracker.finish()
+    answer = tracker.step(2 * S, scans[2], Place(SMALL_STEPS[2]))
+    assert (answer.reference_ns, tracker.n_restarts) == (S, 1)
+
+
 def test_a_failed_scan_leaves_the_reference_and_the_chain(tracker, asked) -> None:
     guesses, fates = asked
     tracker.step(0, POINTS, Place(POSES[0]))
