@@ -141,8 +141,7 @@ def _figure(shown: dict[str, _Walk]) -> Any:
             axes.set_xlabel("x in m")
             if column == 0:
                 axes.set_ylabel(f"y in m (errors × {factor:g})")
-            if row == column == 0:
-                axes.legend(fontsize=8)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="upper center", ncols=4)
     return figure
 
 
