@@ -166,24 +166,24 @@ class Worker:
             self._poses.clear()
         if self._transforms is not None:
             self._transforms.clear()
-        self._forget("clock_jump", "time jumped back while it waited")
+        self._forget("clock_jump", "time jumped back")
 
     def stop(self) -> None:
         """Nothing more will be heard for a while: forget everything."""
         self._poses.clear()
         if self._transforms is not None:
             self._transforms.clear()
-        self._forget("deactivated", "the node was deactivated while it waited")
+        self._forget("deactivated", "the node was deactivated")
 
     def reset(self) -> None:
         """Forget the reference and the chain; the next cloud starts anew."""
         self._tracker.reset("it was told to")
 
-    def _forget(self, reason: str, sentence: str) -> None:
-        for skip in self._intake.clear(reason, sentence):
+    def _forget(self, reason: str, event: str) -> None:
+        for skip in self._intake.clear(reason, f"{event} while it waited"):
             self._skip(skip)
         self._newest_cloud_ns = None
-        self._tracker.reset(sentence)
+        self._tracker.reset(event)
 
     def _admitted(self, stamp_ns: int, message: PointCloud2, now_ns: int) -> Array | Skip:
         """Return the points of a cloud in its turn; a damaged one does not move the clock."""
