@@ -152,7 +152,7 @@ def files(folder):
 
 def test_killed_at_random_moments_the_dataset_is_that_of_an_undisturbed_run(tmp_path):
     """kill -9, five times: after some pairs were written, a random part of a pair later."""
-    (tmp_path / "config.yaml").write_text(CONFIG.replace("n_samples: 20", "n_samples: 60"))
+    (tmp_path / "config.yaml").write_text(CONFIG.replace("n_samples: 20", "n_samples: 200"))
     recordings = [write_kitti(tmp_path / "long", 0, n_scans=8)]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert started(tmp_path, recordings, whole).wait(120) == 0
