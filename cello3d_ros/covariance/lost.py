@@ -19,7 +19,8 @@ class Lost(NamedTuple):
     """What a model knows of registrations in other minima than that of the truth.
 
     limit_m: a sandwich that is wider in translation is taken for that of such a registration.
-    covariance: (6, 6), ``mean(xi xi^T)`` of those met in sampling, reading side, about the truth.
+    covariance: (6, 6), ``sampled_covariance`` of those met in sampling, reading side: about the
+    truth, not about their mean.
     """
 
     limit_m: float

@@ -533,6 +533,14 @@ def test_the_limit_is_what_three_pairs_in_a_hundred_exceed() -> None:
     assert known_lost(dataclasses.replace(examples, shapes={})) is None
 
 
+def test_lost_registrations_scatter_about_the_truth_not_about_their_mean() -> None:
+    lost_xi = np.random.default_rng(5).normal(size=(40, 6)) + [3.0, 0, 0, 0, 0, 0.5]
+    S = np.tile(np.eye(6), (8, 1, 1))
+    known = known_lost(dataclasses.replace(some(8), shapes={"sandwich": S}, lost_xi=lost_xi))
+    assert known is not None
+    np.testing.assert_allclose(known.covariance, lost_xi.T @ lost_xi / 39, rtol=1e-12)
+
+
 def test_the_papers_form_knows_nothing_of_other_minima() -> None:
     lost_xi = np.random.default_rng(4).normal(size=(400, 6))
     examples = dataclasses.replace(some(), lost_xi=lost_xi)
