@@ -152,9 +152,8 @@ def _choose(distances2: Array, n_rows: int, k: int, threshold2: float, chosen: I
         n += distances2[c] <= threshold2
     if n <= k:
         return n
-    n_equal = k - _count(
-        distances2, n_rows, np.nextafter(threshold2, -1.0)
-    )  # to be taken of the equal
+    n_below = _count(distances2, n_rows, np.nextafter(threshold2, -1.0))
+    n_equal = k - n_below  # to be taken of the equal
     n = 0
     for c in range(16 * n_rows):
         chosen[n] = c

@@ -45,8 +45,8 @@ def describe(
     """Describe a registered pair.
 
     T_ref_read: (4, 4); n_rotations: 0 where nobody looks at descriptors, which then are not made;
-    n_threads changes no result.  Raises NoOverlapError when too little
-    overlaps and RegistrationError when the geometry leaves a direction free.
+    n_threads changes no result.  Raises NoOverlapError when too little overlaps and
+    RegistrationError when the geometry leaves a direction free.
     """
     radius_m, k = pipeline.overlap.radius_m, pipeline.icp.n_neighbors
     overlap = find_overlap(reading, reference, T_ref_read, radius_m, k, n_threads)

@@ -62,13 +62,12 @@ def estimate(
     """Register two clouds and find the covariance of the result.
 
     reading: its local shape is looked at only where ``needs_shape`` says so; T_init: (4, 4), the
-    first guess of T_ref_read.  method: a name of ``METHODS``.  registration:
-    the result of whoever registered the clouds (``registered_elsewhere``); ICP is then not run
-    and T_init not looked at.  A registration that reached its last
-    iteration is returned with ``converged`` False: its covariance says little.  Raises
-    RegistrationError when ICP or the method has no answer, NoOverlapError when the clouds share
-    too little and ModelError when the model looks at the descriptor and the grid is not the
-    model's.
+    first guess of T_ref_read.  method: a name of ``METHODS``.  registration: the result of whoever
+    registered the clouds (``registered_elsewhere``); ICP is then not run and T_init not looked at.
+    A registration that reached its last iteration is returned with ``converged`` False: its
+    covariance says little.  Raises RegistrationError when ICP or the method has no answer,
+    NoOverlapError when the clouds share too little and ModelError when the model looks at the
+    descriptor and the grid is not the model's.
     """
     if _looks_at_descriptor(model) and pipeline.grid != model.pipeline.grid:
         raise ModelError(f"the model was trained with {model.pipeline.grid}, not {pipeline.grid}")

@@ -41,8 +41,7 @@ class MethodSettings(NamedTuple):
     sigma_m: deviation of the sensor's noise along each axis; n_registrations: extra runs of ICP
     by ``monte_carlo`` and ``fused``; unknown_quantile: the ``novelty`` beyond which a pair is
     unlike all examples; widen_unknown: whether the model's prediction is then widened to their
-    mean;
-    scale: what ``estimate`` multiplies every covariance by; n_threads changes no result.
+    mean; scale: what ``estimate`` multiplies every covariance by; n_threads changes no result.
     """
 
     sigma_m: float = 0.01

@@ -192,8 +192,7 @@ def nearest(moved: Array, index: Places, cap2: float, distances2: Array, indices
                 for j in range(k):
                     lane = np.int64(keys[j] & 63)
                     p = np.int64(lane_numbers[block + (lane >> 4), 3, lane & 15])
-                    dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
-                    d2 = dx * dx + dy * dy + dz * dz
+                    d2 = _distance2(points, p, x, y, z)
                     m = j  # in place already, but for rounding
                     while m > 0 and _is_before(d2, p, distances2[i, m - 1], indices[i, m - 1]):
                         distances2[i, m], indices[i, m] = distances2[i, m - 1], indices[i, m - 1]
