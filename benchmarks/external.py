@@ -28,8 +28,8 @@ from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import mahalanobis
 from cello3d_ros.recordings import Recording, Scan, open_recording
 from cello3d_ros.recordings.odometry import with_odometry
-from cello3d_ros.ros.guess import EXTERNAL, ODOMETRY, Place
-from cello3d_ros.ros.tracker import Answer, Tracker
+from cello3d_ros.tracking.guess import EXTERNAL, ODOMETRY, Place
+from cello3d_ros.tracking.tracker import Answer, Tracker
 
 CHI2_95 = 12.592  # of 6 degrees of freedom
 

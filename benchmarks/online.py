@@ -270,7 +270,7 @@ def loaded(
 
 def hall(n_points: int, n_places: int = 20) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return poses on a circle in a hall with a crate in it, and what is seen from each."""
-    from cello3d_ros.ros.warmup import room
+    from cello3d_ros.tracking.warmup import room
 
     rng, places = np.random.default_rng(0), []
     for angle in np.linspace(0, 2 * np.pi, n_places, endpoint=False):

@@ -19,7 +19,7 @@ from cello3d_ros.errors import Cello3dError, DatasetError, RecordingError
 if TYPE_CHECKING:
     from cello3d_ros.covariance.methods import MethodSettings
     from cello3d_ros.covariance.model import Model
-    from cello3d_ros.learning.comparison import Predictions
+    from cello3d_ros.evaluation.comparison import Predictions
     from cello3d_ros.learning.dataset import Dataset
     from cello3d_ros.learning.examples import Examples
     from cello3d_ros.recordings.recording import Recording
@@ -111,7 +111,7 @@ def run(arguments: argparse.Namespace) -> None:
     from cello3d_ros.config import NodeConfig
     from cello3d_ros.covariance.methods import MethodSettings
     from cello3d_ros.covariance.model import find_model, load_model
-    from cello3d_ros.learning.comparison import (
+    from cello3d_ros.evaluation.comparison import (
         from_dataset,
         mean_of,
         seen_recordings,
@@ -246,8 +246,8 @@ def _add_online(
     """Run the methods that need clouds on the pairs of the recordings that were given."""
     from tqdm import tqdm
 
-    from cello3d_ros.learning.comparison import add_answers
-    from cello3d_ros.learning.online import answers
+    from cello3d_ros.evaluation.comparison import add_answers
+    from cello3d_ros.evaluation.online import answers
 
     for name, recording in recordings.items():
         rows = [row for row, key in enumerate(keys) if key[0] == name]
@@ -266,9 +266,9 @@ def _pairs_report(
     exact_poses: Sequence[str],
 ) -> dict[str, Any]:
     """Return the pose check, the figures without the flagged pairs and with all, and every KL."""
-    from cello3d_ros.learning.comparison import compare, divergences
-    from cello3d_ros.learning.evaluation import pose_check
-    from cello3d_ros.learning.evidence import calibration, fits
+    from cello3d_ros.evaluation.comparison import compare, divergences
+    from cello3d_ros.evaluation.evidence import calibration, fits
+    from cello3d_ros.learning.measures import pose_check
 
     checks = [pose_check(xi) for xi in examples.xi]
     for (name, _, _), check in zip(keys, checks, strict=True):
@@ -301,7 +301,7 @@ def _worst_pairs(
     predictions: Predictions,
 ) -> list[dict[str, Any]]:
     """Return what there is to see of the pairs whose covariances the model misses most."""
-    from cello3d_ros.learning.evidence import N_WORST, seen
+    from cello3d_ros.evaluation.evidence import N_WORST, seen
 
     order = sorted(
         (k for k, pair in enumerate(pairs) if not pair["flagged"]),
@@ -339,9 +339,9 @@ def _pose_checks(
 def _trajectories(
     recordings: dict[str, Recording], model: Model, arguments: argparse.Namespace
 ) -> dict[str, Any]:
-    from cello3d_ros.learning.evidence import drawn
-    from cello3d_ros.learning.online import prepared
-    from cello3d_ros.learning.trajectories import consistency, length_m, odometry_runs
+    from cello3d_ros.evaluation.evidence import drawn
+    from cello3d_ros.evaluation.online import prepared
+    from cello3d_ros.evaluation.trajectories import consistency, length_m, odometry_runs
 
     report: dict[str, Any] = {}
     for name, recording in recordings.items() if arguments.trajectories else ():

@@ -16,8 +16,8 @@ from cello3d_ros.errors import RecordingError
 if TYPE_CHECKING:
     from cello3d_ros.config import NodeConfig
     from cello3d_ros.geometry.se3 import Array
-    from cello3d_ros.ros.offline import Step
-    from cello3d_ros.ros.tracker import Answer
+    from cello3d_ros.tracking.offline import Step
+    from cello3d_ros.tracking.tracker import Answer
 
 _PREFIX = "/covariance_node"
 
@@ -43,8 +43,8 @@ def run(arguments: argparse.Namespace) -> None:
     """
     from cello3d_ros.config import PIPELINE, Config, load_config
     from cello3d_ros.covariance.model import find_model, load_model
-    from cello3d_ros.ros.offline import replay
-    from cello3d_ros.ros.tracker import Tracker
+    from cello3d_ros.tracking.offline import replay
+    from cello3d_ros.tracking.tracker import Tracker
 
     recording = open_source(arguments.recording, arguments)
     model = load_model(find_model(arguments.model))
@@ -118,7 +118,7 @@ def _recorded(
 
 
 def _published(Y: Array, T: Array, config: NodeConfig) -> Array:
-    from cello3d_ros.ros.covariances import ros_covariance
+    from cello3d_ros.tracking.covariances import ros_covariance
 
     return ros_covariance(
         Y, T[:3, :3], config.floor_sigma_m, config.floor_sigma_rad, config.ceiling

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the page.  Raises EvaluationError for a file that is damaged or too old."""
-    from cello3d_ros.reporting.evaluation_file import EvaluationError, read_evaluation
+    from cello3d_ros.evaluation.evaluation_file import EvaluationError, read_evaluation
     from cello3d_ros.reporting.page import page
 
     out: Path = arguments.out

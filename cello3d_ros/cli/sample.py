@@ -72,8 +72,8 @@ def run(arguments: argparse.Namespace) -> None:
     from cello3d_ros.learning.dataset import open_dataset
     from cello3d_ros.learning.identity import fingerprint, scan_prints
     from cello3d_ros.recordings import open_recording
-    from cello3d_ros.recordings.rescan import rescannable
-    from cello3d_ros.recordings.simulation import Simulation
+    from cello3d_ros.simulation.rescan import rescannable
+    from cello3d_ros.simulation.simulation import Simulation
 
     config = load_config(arguments.config) if arguments.config else Config()
     sampling = _sampling(config, arguments)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from cello3d_ros.cli.sources import with_progress
 from cello3d_ros.errors import RecordingError
-from cello3d_ros.recordings.rescan import KEY, told
-from cello3d_ros.recordings.scanner import SCANNERS, Scanner
-from cello3d_ros.recordings.simulation import Simulation
-from cello3d_ros.recordings.worlds import WORLDS
+from cello3d_ros.simulation.rescan import KEY, told
+from cello3d_ros.simulation.scanner import SCANNERS, Scanner
+from cello3d_ros.simulation.simulation import Simulation
+from cello3d_ros.simulation.worlds import WORLDS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

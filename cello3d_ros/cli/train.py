@@ -15,7 +15,7 @@ from cello3d_ros.config import TrainingConfig, load_config
 from cello3d_ros.errors import Cello3dError, DatasetError
 
 if TYPE_CHECKING:
-    from cello3d_ros.learning.evaluation import Figures
+    from cello3d_ros.learning.measures import Figures
 
 _FLAGS = ("shape", "features", "theta", "loss", "optimizer")
 _COLUMNS = (  # heading, figure

@@ -33,8 +33,8 @@ from cello3d_ros.learning.sampling import (
 )
 from cello3d_ros.recordings import open_recording
 from cello3d_ros.recordings.recording import Scan
-from cello3d_ros.recordings.rescan import rescannable
-from cello3d_ros.recordings.scanner import Echoes
+from cello3d_ros.simulation.rescan import rescannable
+from cello3d_ros.simulation.scanner import Echoes
 
 _REMEMBERED = 8  # scans that a worker keeps behind the one it has read last
 

@@ -17,9 +17,9 @@ from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import IcpConfig, Pipeline
 from cello3d_ros.errors import CloudError
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.recordings.scanner import Echoes, measure
 from cello3d_ros.registration.backends import register
 from cello3d_ros.registration.icp import Registration
+from cello3d_ros.simulation.scanner import Echoes, measure
 
 
 def register_many_noisy(

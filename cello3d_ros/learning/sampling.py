@@ -27,8 +27,8 @@ from cello3d_ros.learning.dataset import PairRecord
 from cello3d_ros.learning.noise import register_many_noisy, register_many_rescanned
 from cello3d_ros.learning.precision import eigenvalue_errors
 from cello3d_ros.recordings.recording import Recording, Scan
-from cello3d_ros.recordings.scanner import Echoes
 from cello3d_ros.registration.backends import register, register_many
+from cello3d_ros.simulation.scanner import Echoes
 
 PENDING = "not_sampled"  # the reason of a record that is described and no more
 BLOCK = 500  # registrations between two reports of progress

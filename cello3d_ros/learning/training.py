@@ -21,7 +21,6 @@ from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.packed import unpack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import package_versions
-from cello3d_ros.learning.evaluation import Figures, evaluate
 from cello3d_ros.learning.examples import (
     Examples,
     feature_scaler,
@@ -41,6 +40,7 @@ from cello3d_ros.learning.loss import (
     select_targets,
     validation_problem,
 )
+from cello3d_ros.learning.measures import Figures, evaluate
 
 Progress = Callable[[int, float, float], None]  # iteration, training loss, what Theta is judged by
 

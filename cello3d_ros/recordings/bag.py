@@ -11,15 +11,15 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from cello3d_ros.clouds.point_times import INTENSITIES, NAMES, TimeLaw, recognise, relative_s
 from cello3d_ros.clouds.pointcloud2 import read_fields
 from cello3d_ros.errors import Cello3dError, RecordingError
+from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.geometry.transforms import PoseLog, TransformTree
 from cello3d_ros.recordings.bag_writer import write_bag
-from cello3d_ros.recordings.odometry import PoseTrack
-from cello3d_ros.recordings.point_times import INTENSITIES, NAMES, TimeLaw, recognise, relative_s
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.recordings.topics import POSE_TYPES, TF_STATIC, TF_TYPES, choose
-from cello3d_ros.recordings.transforms import PoseLog, TransformTree
 
 __all__ = ["BagRecording", "write_bag"]
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from cello3d_ros.errors import RecordingError
-from cello3d_ros.recordings.odometry import PoseTrack
+from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.recordings.recording import Recording, Scan
 
 

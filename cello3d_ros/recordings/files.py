@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cello3d_ros.clouds.point_times import INTENSITIES, NAMES, TimeLaw, recognise, relative_s
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings import pcd, ply, tables
-from cello3d_ros.recordings.point_times import INTENSITIES, NAMES, TimeLaw, recognise, relative_s
 from cello3d_ros.recordings.recording import Scan
 
 Columns = dict[str, NDArray[Any]]

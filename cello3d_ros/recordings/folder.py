@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from cello3d_ros.errors import RecordingError
+from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings import tables
 from cello3d_ros.recordings.files import READERS, read_columns, scan_of
 from cello3d_ros.recordings.kitti import STEP_NS
-from cello3d_ros.recordings.odometry import PoseTrack
 from cello3d_ros.recordings.poses import (
     StampedRows,
     check_order,

@@ -10,10 +10,10 @@ import numpy as np
 
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings import tables
 from cello3d_ros.recordings.files import read_columns, scan_of
-from cello3d_ros.recordings.odometry import PoseTrack
 from cello3d_ros.recordings.poses import check_order, rigid, stamps_of
 from cello3d_ros.recordings.recording import Scan
 

@@ -12,8 +12,7 @@ from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.se3 import Array
 
 if TYPE_CHECKING:
-    from cello3d_ros.recordings.odometry import PoseTrack
-    from cello3d_ros.recordings.scanner import Echoes
+    from cello3d_ros.geometry.pose_track import PoseTrack
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +25,8 @@ class Scan:
     T_odom_sensor: (4, 4) odometry at the stamp, or None.
     intensity: (N,) float64 in the sensor's own unit, or None.
     time_s: (N,) float64, when each point was measured, after the stamp; or None.
-    echoes: of a simulated scan, what its beams met, from which it can be scanned again; or None.
+    echoes: of a simulated scan, what its beams met (``simulation.scanner.Echoes``), from which it
+        can be scanned again; or None.
     """
 
     stamp_ns: int
@@ -35,7 +35,7 @@ class Scan:
     T_odom_sensor: Array | None = None
     intensity: Array | None = None
     time_s: Array | None = None
-    echoes: Echoes | None = None
+    echoes: Any = None
 
     def __post_init__(self) -> None:
         for name in ("intensity", "time_s"):

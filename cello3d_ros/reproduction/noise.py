@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 
 from cello3d_ros.config import Pipeline, SamplingConfig
+from cello3d_ros.evaluation.online import prepared
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.learning.online import prepared
 from cello3d_ros.learning.sampling import sample_recording
-from cello3d_ros.recordings.scanner import SCANNERS
-from cello3d_ros.recordings.simulation import Simulation
 from cello3d_ros.reproduction import drawing
 from cello3d_ros.reproduction.datasets import SCANNER
 from cello3d_ros.reproduction.result import Result, markdown_table
 from cello3d_ros.reproduction.scenes import censi_of, cube, errors
+from cello3d_ros.simulation.scanner import SCANNERS
+from cello3d_ros.simulation.simulation import Simulation
 
 SIGMAS_M = (0.001, 0.002, 0.005, 0.01, 0.02, 0.03, 0.05)
 _N_POINTS = 1000

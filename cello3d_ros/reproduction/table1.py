@@ -9,12 +9,12 @@ import numpy as np
 
 from cello3d_ros.covariance.methods import MethodSettings
 from cello3d_ros.errors import DatasetError, RegistrationError
+from cello3d_ros.evaluation.comparison import from_dataset
+from cello3d_ros.evaluation.online import prepared
 from cello3d_ros.geometry.se3 import Array, inverse
-from cello3d_ros.learning.comparison import from_dataset
 from cello3d_ros.learning.dataset import Dataset
-from cello3d_ros.learning.evaluation import figures
 from cello3d_ros.learning.examples import load_examples
-from cello3d_ros.learning.online import prepared
+from cello3d_ros.learning.measures import figures
 from cello3d_ros.recordings import Recording
 from cello3d_ros.registration.backends import register
 from cello3d_ros.reproduction import drawing

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from cello3d_ros.errors import DatasetError
-from cello3d_ros.learning.online import prepared
-from cello3d_ros.learning.trajectories import Runs, consistency, length_m, odometry_runs
+from cello3d_ros.evaluation.online import prepared
+from cello3d_ros.evaluation.trajectories import Runs, consistency, length_m, odometry_runs
 from cello3d_ros.reproduction import drawing
 from cello3d_ros.reproduction.datasets import Recordings, Workshop
 from cello3d_ros.reproduction.models import datasets, testable, trained

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cello3d_ros.errors import DatasetError
+from cello3d_ros.evaluation.online import prepared
+from cello3d_ros.evaluation.trajectories import Runs, compound_path, odometry_runs
 from cello3d_ros.geometry.gaussian import GaussianPose, to_fixed_axes
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.learning.dataset import Dataset
-from cello3d_ros.learning.online import prepared
-from cello3d_ros.learning.trajectories import Runs, compound_path, odometry_runs
 from cello3d_ros.reproduction import drawing
 from cello3d_ros.reproduction.datasets import Recordings, Workshop, sampled
 from cello3d_ros.reproduction.models import datasets, testable, trained

@@ -12,9 +12,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.covariance.estimator import Estimate
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.ros.covariances import N_SIGMA, principal_axes
 from cello3d_ros.ros.messages import time_of
-from cello3d_ros.ros.tracker import Answer
+from cello3d_ros.tracking.covariances import N_SIGMA, principal_axes
+from cello3d_ros.tracking.tracker import Answer
 
 ANSWERED, REFERENCE, WAITING, INACTIVE = "answered", "reference", "waiting", "inactive"
 OK, WARN, ERROR = 0, 1, 2

@@ -16,8 +16,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.ros.covariances import N_SIGMA, principal_axes
 from cello3d_ros.ros.messages import duration_of, pose_to, time_of
+from cello3d_ros.tracking.covariances import N_SIGMA, principal_axes
 
 RADIAN_M = 10.0
 N_TRAIL = 50  # answers shown; older ones are overwritten

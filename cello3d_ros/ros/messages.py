@@ -15,9 +15,9 @@ from cello3d_ros.errors import ConfigError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import to_fixed_axes
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.ros.covariances import CovarianceError as CovarianceError
-from cello3d_ros.ros.covariances import ros_covariance as ros_covariance
-from cello3d_ros.ros.odometry import checked_pose
+from cello3d_ros.tracking.covariances import CovarianceError as CovarianceError
+from cello3d_ros.tracking.covariances import ros_covariance as ros_covariance
+from cello3d_ros.tracking.odometry import checked_pose
 
 
 def stamp_ns_of(message: Any) -> int:

@@ -37,14 +37,14 @@ from cello3d_ros.errors import Cello3dError, ConfigError
 from cello3d_ros.ros import parameters
 from cello3d_ros.ros.diagnostics import Statistics
 from cello3d_ros.ros.inputs import Role, Topic, topics
-from cello3d_ros.ros.intake import JUMP_NS, Job, Skip
 from cello3d_ros.ros.life import ManagedNode
 from cello3d_ros.ros.logbook import Logbook
 from cello3d_ros.ros.messages import tf_message
 from cello3d_ros.ros.outputs import Outputs
-from cello3d_ros.ros.tracker import Answer, reason_of
-from cello3d_ros.ros.warmup import warm_up
 from cello3d_ros.ros.worker import Worker
+from cello3d_ros.tracking.intake import JUMP_NS, Job, Skip
+from cello3d_ros.tracking.tracker import Answer, reason_of
+from cello3d_ros.tracking.warmup import warm_up
 
 _PATIENCE_S = 0.05  # longest time for which work is put off to hear what came before it
 _TICK_S = 0.05  # how often it is looked whether a cloud has waited too long

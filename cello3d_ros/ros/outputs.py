@@ -11,11 +11,11 @@ from visualization_msgs.msg import MarkerArray
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.geometry.se3 import Array, log
 from cello3d_ros.ros import messages
-from cello3d_ros.ros.covariances import twist_covariance
 from cello3d_ros.ros.diagnostics import Verdict, judged
-from cello3d_ros.ros.intake import Job
 from cello3d_ros.ros.markers import markers_to
-from cello3d_ros.ros.tracker import Answer
+from cello3d_ros.tracking.covariances import twist_covariance
+from cello3d_ros.tracking.intake import Job
+from cello3d_ros.tracking.tracker import Answer
 
 
 class Outputs:

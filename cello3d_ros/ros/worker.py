@@ -20,11 +20,11 @@ from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import CloudError
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.ros import messages
-from cello3d_ros.ros.frames import TransformBuffer
-from cello3d_ros.ros.guess import Locator
-from cello3d_ros.ros.intake import JUMP_NS, Intake, Job, Skip, stamp_order
-from cello3d_ros.ros.odometry import OdometryBuffer, OdometryError, PoseSource
-from cello3d_ros.ros.tracker import Answer, Tracker
+from cello3d_ros.tracking.frames import TransformBuffer
+from cello3d_ros.tracking.guess import Locator
+from cello3d_ros.tracking.intake import JUMP_NS, Intake, Job, Skip, stamp_order
+from cello3d_ros.tracking.odometry import OdometryBuffer, OdometryError, PoseSource
+from cello3d_ros.tracking.tracker import Answer, Tracker
 
 MAX_CLOUD_BYTES = 64 * 1024**2  # of a message on points: work takes up to 30 times its size
 MAX_MAP_BYTES = 1024**3  # of one on reference_points, which is cropped before it is worked on

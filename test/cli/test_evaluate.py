@@ -240,7 +240,7 @@ def test_the_registration_that_is_judged_starts_from_the_truth(
         starts.append(T_init)
         return Registration(T_init, 1, True, "", 0.0, 1)
 
-    monkeypatch.setattr("cello3d_ros.learning.online.register", remember)
+    monkeypatch.setattr("cello3d_ros.evaluation.online.register", remember)
     words = ("--only", "walk", "--recordings", walk, "--online-pairs", 1)
     assert evaluate(folder, *words) == 0
     T_0, T_1 = np.eye(4), exp([0.3, 0.1, 0, 0, 0, 0.1])

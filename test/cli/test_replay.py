@@ -16,7 +16,7 @@ from cello3d_ros.geometry.se3 import exp, inverse, transform
 from cello3d_ros.recordings import Scan
 from cello3d_ros.recordings.bag import write_bag
 from cello3d_ros.recordings.poses import read_tum
-from cello3d_ros.ros.warmup import room
+from cello3d_ros.tracking.warmup import room
 
 N = 6
 TOPICS = ("/covariance_node/relative_pose", "/covariance_node/pose")

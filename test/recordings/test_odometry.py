@@ -5,7 +5,8 @@ import pytest
 
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
-from cello3d_ros.recordings.odometry import PoseTrack, drift_odometry
+from cello3d_ros.geometry.pose_track import PoseTrack
+from cello3d_ros.recordings.odometry import drift_odometry
 
 
 def walk(n: int, step: float, turn: float):

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from cello3d_ros.cli.main import main
+from cello3d_ros.evaluation.evidence import PROBABILITIES
 from cello3d_ros.geometry.se3 import exp
-from cello3d_ros.learning.evidence import PROBABILITIES
 
 NASTY = '<img src=x onerror="alert(1)"></script>&'
 

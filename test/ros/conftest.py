@@ -13,7 +13,7 @@ from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import is_positive_definite
 from cello3d_ros.ros.process import NodeProcess, environment
-from cello3d_ros.ros.warmup import room
+from cello3d_ros.tracking.warmup import room
 
 DOMAIN_ID = 1 + os.getpid() % 100
 

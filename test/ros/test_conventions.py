@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import compound_right, to_fixed_axes
-from cello3d_ros.ros.covariances import ros_covariance, twist_covariance
+from cello3d_ros.tracking.covariances import ros_covariance, twist_covariance
 
 PAGE = Path(__file__).parents[2] / "docs" / "covariance_conventions.md"
 BOUNDS = (1e-6, 1e-6, 900.0)

@@ -14,7 +14,7 @@ from cello3d_ros.covariance.estimator import Estimate
 from cello3d_ros.geometry import se3
 from cello3d_ros.registration.icp import Registration
 from cello3d_ros.ros.diagnostics import ERROR, OK, WARN, Statistics, Verdict, judged
-from cello3d_ros.ros.tracker import Answer
+from cello3d_ros.tracking.tracker import Answer
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "diagnostics.md").read_text()

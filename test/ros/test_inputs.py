@@ -22,7 +22,7 @@ from cello3d_ros.geometry import se3
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.ros import messages, replay
 from cello3d_ros.ros.process import NodeProcess
-from cello3d_ros.ros.warmup import room
+from cello3d_ros.tracking.warmup import room
 
 T0 = 10**18
 STEP_NS = 100_000_000

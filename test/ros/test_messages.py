@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from cello3d_ros.geometry import se3
 from cello3d_ros.ros import messages
-from cello3d_ros.ros.odometry import OdometryError
+from cello3d_ros.tracking.odometry import OdometryError
 
 LIMITS = (1e-4, 1e-5, 900.0)
 

@@ -18,7 +18,7 @@ from cello3d_ros.geometry.gaussian import to_fixed_axes
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.ros import markers, replay
 from cello3d_ros.ros.process import NodeProcess
-from cello3d_ros.ros.warmup import room
+from cello3d_ros.tracking.warmup import room
 
 MODES = NodeConfig.__dataclass_fields__["covariance_mode"].metadata["choices"]
 STEP_S = 0.2

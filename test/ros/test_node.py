@@ -21,7 +21,7 @@ class InMemory(list):
 @pytest.fixture(scope="module")
 def recording() -> InMemory:
     """Ten scans of a room, with odometry that is a little wrong."""
-    from cello3d_ros.ros.warmup import room
+    from cello3d_ros.tracking.warmup import room
 
     rng = np.random.default_rng(3)
     scans = InMemory()

@@ -12,7 +12,7 @@ from cello3d_ros.covariance.estimator import Estimate
 from cello3d_ros.geometry import se3
 from cello3d_ros.registration.icp import Registration
 from cello3d_ros.ros import messages, outputs
-from cello3d_ros.ros.tracker import Answer
+from cello3d_ros.tracking.tracker import Answer
 
 S = 1_000_000_000
 STEP = se3.exp([0.2, 0.01, 0.0, 0.0, 0.01, 0.05])

@@ -13,9 +13,9 @@ pytest.importorskip("rclpy")
 from cello3d_ros.config import Config
 from cello3d_ros.covariance.model import constant_model
 from cello3d_ros.ros import messages
-from cello3d_ros.ros.intake import Skip
 from cello3d_ros.ros.process import NodeDiedError, NodeProcess
 from cello3d_ros.ros.worker import MAX_CLOUD_BYTES, Worker
+from cello3d_ros.tracking.intake import Skip
 
 START_MB = 400.0  # resident memory of a node that has imported everything, with room to spare
 

@@ -14,7 +14,7 @@ from cello3d_ros.geometry import se3
 from cello3d_ros.ros import parameter_file
 from cello3d_ros.ros.process import NodeDiedError, NodeProcess, shared_file
 from cello3d_ros.ros.replay import Player
-from cello3d_ros.ros.warmup import room
+from cello3d_ros.tracking.warmup import room
 
 
 def last_words(log: Path, domain_id: int, parameters, ros_arguments=()) -> str:

@@ -1,0 +1,1 @@
+"""How good predicted covariances are: methods side by side, chains, one result."""

@@ -1,0 +1,210 @@
+"""All methods side by side on the pairs of a dataset, with and without their clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cello3d_ros.config import differences
+from cello3d_ros.covariance.methods import METHODS, MethodSettings, extra_runs, mean_example
+from cello3d_ros.covariance.model import Model, predict
+from cello3d_ros.errors import DatasetError
+from cello3d_ros.evaluation.online import Answer
+from cello3d_ros.geometry.gaussian import kl, larger
+from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.learning.dataset import Dataset
+from cello3d_ros.learning.examples import (
+    Examples,
+    load_examples,
+    select_inputs,
+    to_absolute,
+    unturned_rows,
+)
+from cello3d_ros.learning.measures import best_scale, figures, select
+
+BASELINE = "mean_covariance"
+_SCALED = ("hessian", "sandwich", "censi", "sigma_points")
+
+
+@dataclass
+class Predictions:
+    """What each method says of each of N pairs.
+
+    covariances: name -> (N, 6, 6), NaN where there is no answer.  cpu_ms: name -> (N,), NaN where
+    the method was not run on clouds.
+    """
+
+    covariances: dict[str, Array]
+    cpu_ms: dict[str, Array]
+
+
+def seen_recordings(model: Model, known: Mapping[str, set[str]]) -> dict[str, str]:
+    """Return the recordings that the model was trained or validated on: name -> the model's name.
+
+    known: name -> its prints (``prints_of``).  One that has the name of a recording of the model,
+    or a print, is that recording or a part of it.
+    """
+    names: set[str] = set()
+    for role in ("recordings", "validation_recordings"):
+        names |= set(model.provenance.get(role, {}))
+    prints = model.provenance.get("prints", {})
+    twins = {found: name for name in sorted(prints) for found in prints[name]}
+    seen = {
+        name: [name] if name in names else sorted(twins[p] for p in found if p in twins)
+        for name, found in known.items()
+    }
+    return {name: twin[0] for name, twin in seen.items() if twin}
+
+
+def training_mean(model: Model) -> Array:
+    """Return the mean of the covariances that the model was trained on, as it keeps it.  (6, 6).
+
+    Raises DatasetError where it keeps none.
+    """
+    if model.shape == "none":
+        return mean_example(model)
+    try:
+        mean = np.array(model.provenance["mean_covariance"], np.float64).reshape(6, 6)
+    except (KeyError, TypeError, ValueError):
+        raise DatasetError(
+            "the mean of the training covariances is the baseline, and the model does not keep "
+            "it; name datasets whose mean to take by --baseline"
+        ) from None
+    return mean
+
+
+def mean_of(datasets: Sequence[Dataset]) -> Array:
+    """Return the mean of the covariances of all accepted pairs.  (6, 6)."""
+    names = {key[0] for dataset in datasets for key in dataset.pair_keys()}
+    return np.asarray(load_examples(datasets, names).covariances.mean(axis=0))
+
+
+def from_dataset(
+    model: Model, examples: Examples, mean: Array, settings: MethodSettings
+) -> Predictions:
+    """Return what the methods that need no clouds say.
+
+    mean: (6, 6), the baseline.  ``model_widened`` is what the node makes of the model's answer by
+    default: the larger of it and the mean of the examples beyond ``settings.unknown_quantile``.
+    Raises DatasetError where the dataset's settings are not the model's: its descriptors would not
+    be comparable.
+    """
+    found = differences(examples.pipeline, model.pipeline)
+    if model.features == "global":
+        found = [difference for difference in found if not difference.startswith("grid.")]
+    if found:
+        raise DatasetError(f"the dataset does not go with the model: {found[0]}")
+    examples = select_inputs(examples, model.features)
+    if model.shape != "none" and model.shape not in examples.shapes:
+        raise DatasetError(f"the dataset does not hold the {model.shape} of each pair")
+    n = len(examples.covariances)
+    row = unturned_rows(examples).start
+    S: Sequence[Array | None] = [None] * n
+    if model.shape != "none":
+        S = list(examples.shapes[model.shape])
+    answers = [predict(model, d[row], S_k) for d, S_k in zip(examples.features, S, strict=True)]
+    constant = to_absolute(np.tile(mean_example(model), (n, 1, 1)), examples, model.shape)
+    covariances = {
+        BASELINE: np.tile(mean, (n, 1, 1)),
+        "model": np.array([answer.covariance for answer in answers]),
+        "model_widened": np.array(
+            [
+                larger(prior, answer.covariance)
+                if answer.novelty > settings.unknown_quantile
+                else answer.covariance
+                for answer, prior in zip(answers, constant, strict=True)
+            ]
+        ),
+        "constant": constant,
+    }
+    if "hessian" in examples.shapes:
+        covariances["hessian"] = settings.sigma_m**2 * examples.shapes["hessian"]
+    if "sandwich" in examples.shapes:
+        covariances["sandwich"] = examples.shapes["sandwich"]
+    return Predictions(covariances, {})
+
+
+def add_answers(
+    predictions: Predictions, pairs: Sequence[int], answers: list[dict[str, Answer]]
+) -> None:
+    """Enter what methods said of some pairs, by number, from their clouds.
+
+    Methods that ``from_dataset`` knows keep the covariance from there and get their cost.
+    """
+    n = len(predictions.covariances[BASELINE])
+    for name in METHODS:
+        if name not in predictions.covariances:
+            predictions.covariances[name] = np.full((n, 6, 6), np.nan)
+        predictions.cpu_ms.setdefault(name, np.full(n, np.nan))
+    known = {name for name, F in predictions.covariances.items() if np.isfinite(F).all()}
+    for pair, answer in zip(pairs, answers, strict=True):
+        for name, (Y, cpu_ms) in answer.items():
+            predictions.cpu_ms[name][pair] = cpu_ms
+            if name not in known:
+                predictions.covariances[name][pair] = Y
+
+
+def compare(
+    predictions: Predictions,
+    examples: Examples,
+    keep: NDArray[np.bool_],
+    settings: MethodSettings,
+) -> dict[str, Any]:
+    """Return figures of every method over the pairs to keep: overall and for each recording.
+
+    ``<name>_scaled`` is a baseline times the one number that suits all these pairs best: an upper
+    bound of what it could do, since the number is fitted to the answers.
+    """
+    kept = select(examples, keep)
+    F = {name: Y[keep] for name, Y in predictions.covariances.items()}
+    scales = {name: best_scale(F[name], kept) for name in _SCALED if name in F}
+    F |= {f"{name}_scaled": scale * F[name] for name, scale in scales.items()}
+    ms = {name: values[keep] for name, values in predictions.cpu_ms.items()}
+
+    def over(some: NDArray[np.bool_]) -> dict[str, Any]:
+        part = select(kept, some)
+        methods = {
+            name: figures(Y[some], part, F[BASELINE][some])
+            | _costs(name.removesuffix("_scaled"), Y[some], ms, some, settings)
+            for name, Y in F.items()
+        }
+        for name, scale in scales.items():
+            methods[f"{name}_scaled"]["scale"] = scale
+        return {"n_pairs": int(some.sum()), "methods": methods}
+
+    report = over(np.ones(len(kept.groups), np.bool_))
+    report["recordings"] = {
+        str(name): over(kept.groups == name) for name in np.unique(kept.groups)
+    }
+    return report
+
+
+def divergences(predictions: Predictions, examples: Examples, pair: int) -> dict[str, float]:
+    """Return the KL of one pair by every method that has an answer."""
+    return {
+        name: float(kl(examples.covariances[pair], F[pair]))
+        for name, F in predictions.covariances.items()
+        if np.isfinite(F[pair]).all()
+    }
+
+
+def _costs(
+    name: str,
+    F: Array,
+    ms: dict[str, Array],
+    some: NDArray[np.bool_],
+    settings: MethodSettings,
+) -> dict[str, Any]:
+    """Return the extra cost of a pair; ``ms_per_pair`` is None where no clouds were given."""
+    times = ms.get(name, np.full(len(some), np.nan))[some]
+    ran = np.isfinite(times)
+    failed = ran & ~np.isfinite(F).all(axis=(1, 2))
+    return {
+        "n_failed": int(failed.sum()),
+        "ms_per_pair": float(times[ran].mean()) if ran.any() else None,
+        "icp_runs": extra_runs(name, settings),
+    }

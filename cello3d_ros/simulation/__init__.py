@@ -1,0 +1,1 @@
+"""Simulated recordings: worlds, scanners and paths."""

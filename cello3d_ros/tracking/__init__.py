@@ -1,0 +1,1 @@
+"""What a robot does with a stream of clouds and odometry, without ROS."""

@@ -1,0 +1,127 @@
+"""Where the sensor is when it takes a cloud: the first guess of a registration.  No ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cello3d_ros.config import NodeConfig
+from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.tracking.frames import TransformBuffer, UnknownFrameError
+from cello3d_ros.tracking.odometry import OdometryError, OdometryNotYetError, PoseSource
+
+ODOMETRY, EXTRAPOLATED, CONSTANT_VELOCITY = "odometry", "extrapolated", "constant_velocity"
+EXTERNAL = "external"
+
+
+def _identity() -> Array:
+    return np.eye(4)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the sensor is at the stamp of a cloud, in which frames and who says so.
+
+    T_odom_sensor: (4, 4), None when nobody says it.  T_base_sensor: (4, 4).  T_map_odom: (4, 4),
+    where the frame of the odometry is in that of the reference cloud; None when only answers can
+    tell.  guess: ODOMETRY, EXTRAPOLATED, CONSTANT_VELOCITY or EXTERNAL.  epoch: as in PoseSource.
+    """
+
+    T_odom_sensor: Array | None
+    T_base_sensor: Array = field(default_factory=_identity)
+    T_map_odom: Array | None = None
+    guess: str = ODOMETRY
+    odom_frame: str = "odom"
+    base_frame: str = "base_link"
+    sensor_frame: str = "lidar"
+    epoch: int = 1
+
+
+class Locator:
+    """Says where the sensor is, from odometry or the external registration and the extrinsic."""
+
+    def __init__(
+        self, config: NodeConfig, source: PoseSource, transforms: TransformBuffer | None = None
+    ) -> None:
+        """source: odometry or external poses.  transforms: /tf, or None for T_base_sensor."""
+        self.config = config
+        self.source = source
+        self.transforms = transforms
+        self.map_frame = ""  # of the reference cloud, once there is one
+
+    def place(self, stamp_ns: int, sensor_frame: str, is_late: bool) -> Place:
+        """Return where the sensor is at a stamp.
+
+        is_late: the cloud has waited long enough; what comes later is of no use.  Raises
+        OdometryNotYetError when waiting may help and OdometryMissingError when it will not.
+        """
+        T_odom_base, guess = self._base(stamp_ns, is_late)
+        odom_frame = self.source.frame_id or "odom"
+        base_frame = self.source.child_frame_id or self.config.base_frame
+        T_base_sensor = self._extrinsic(stamp_ns, base_frame, sensor_frame)
+        return Place(
+            None if T_odom_base is None else T_odom_base @ T_base_sensor,
+            T_base_sensor,
+            self._map(stamp_ns, odom_frame),
+            guess,
+            odom_frame,
+            base_frame,
+            sensor_frame,
+            self.source.epoch,
+        )
+
+    def _base(self, stamp_ns: int, is_late: bool) -> tuple[Array | None, str]:
+        config, poses = self.config, self.source.poses
+        if config.registration == "external":
+            return poses.nearest(stamp_ns, config.external_tolerance_s), EXTERNAL
+        policy = config.guess_without_odometry
+        try:
+            return poses.at(stamp_ns), ODOMETRY
+        except OdometryError as error:
+            may_come = isinstance(error, OdometryNotYetError) and not is_late
+            if policy == "skip" or may_come:
+                raise
+        if policy == "extrapolate":
+            return poses.extrapolated(stamp_ns, config.max_extrapolation_s), EXTRAPOLATED
+        return None, CONSTANT_VELOCITY
+
+    def _extrinsic(self, stamp_ns: int, base_frame: str, sensor_frame: str) -> Array:
+        if self.transforms is not None:
+            return self.transforms.at(base_frame, sensor_frame, stamp_ns)
+        return se3.pose(self.config.T_base_sensor[:3], self.config.T_base_sensor[3:])
+
+    def _map(self, stamp_ns: int, odom_frame: str) -> Array | None:
+        if not self.map_frame:
+            return None
+        if self.config.registration == "external" and odom_frame != self.map_frame:
+            raise UnknownFrameError(
+                f"the {self.source.poses.what} is in {odom_frame!r} but the reference cloud in "
+                f"{self.map_frame!r}"
+            )
+        if odom_frame == self.map_frame or self.transforms is None:
+            return None
+        return self.transforms.at(self.map_frame, odom_frame, stamp_ns)
+
+
+class Motion:
+    """The last two poses of a chain, carried on at constant velocity."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, Array] | None = None
+        self._velocity = np.zeros(6)
+
+    def add(self, stamp_ns: int, T: Array) -> None:
+        """Remember the next pose (4, 4) of the chain."""
+        if self._last is not None and stamp_ns > self._last[0]:
+            span_s = 1e-9 * (stamp_ns - self._last[0])
+            self._velocity = se3.log(se3.inverse(self._last[1]) @ T) / span_s
+        self._last = (stamp_ns, T)
+
+    def at(self, stamp_ns: int) -> Array:
+        """Return the pose ``T_last exp(dt v)``; the last one of one, identity of none.  (4, 4)."""
+        if self._last is None:
+            return np.eye(4)
+        dt_s = 1e-9 * (stamp_ns - self._last[0])
+        return np.asarray(self._last[1] @ se3.exp(dt_s * self._velocity))
