@@ -1,8 +1,15 @@
 """Errors that a user can act on; the command line and the node turn each into one sentence."""
 
+from typing import ClassVar
+
 
 class Cello3dError(Exception):
-    """Root of every error that this package raises on purpose."""
+    """Root of every error that this package raises on purpose.
+
+    reason: the short name under which the node counts clouds that it skips.
+    """
+
+    reason: ClassVar[str] = "internal"
 
 
 class ConfigError(Cello3dError):
@@ -12,17 +19,37 @@ class ConfigError(Cello3dError):
 class CloudError(Cello3dError):
     """A point cloud cannot be read, or too little of it is left to work with."""
 
+    reason = "too_few_points"
+
 
 class RegistrationError(Cello3dError):
     """ICP has no answer: too few points or a singular system."""
+
+    reason = "registration"
+
+
+class NotConvergedError(RegistrationError):
+    """ICP stopped before it settled."""
+
+    reason = "not_converged"
 
 
 class NoOverlapError(RegistrationError):
     """Two registered clouds share too little geometry."""
 
+    reason = "no_overlap"
+
+
+class CovarianceError(Cello3dError):
+    """A covariance cannot be published."""
+
+    reason = "covariance"
+
 
 class ModelError(Cello3dError):
     """A model file is missing, damaged, of another version or does not fit its use."""
+
+    reason = "beyond_model"
 
 
 class DatasetError(Cello3dError):
@@ -31,3 +58,7 @@ class DatasetError(Cello3dError):
 
 class RecordingError(Cello3dError):
     """A recording cannot be read or written."""
+
+
+class NoRecordingError(RecordingError):
+    """There is no recording at a path."""

@@ -83,7 +83,7 @@ def as_dict(estimate: Estimate) -> dict[str, Any]:
         "nearest_rho": estimate.nearest_rho,
         "novelty": estimate.novelty,
         "probably_lost": estimate.is_lost,
-        "effective_neighbours": estimate.effective_neighbors,
+        "effective_neighbors": estimate.effective_neighbors,
     }
 
 
@@ -103,7 +103,7 @@ def _as_text(answer: dict[str, Any]) -> str:
             f"ICP {state} after {answer['iterations']} iterations, "
             f"{answer['overlap_ratio']:.0%} of the reading overlaps",
             f"nearest example at rho {answer['nearest_rho']:.3g}, "
-            f"{answer['effective_neighbours']:.1f} effective neighbours, novelty "
+            f"{answer['effective_neighbors']:.1f} effective neighbors, novelty "
             f"{answer['novelty']:.2f}",
         ]
     )

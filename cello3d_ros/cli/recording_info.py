@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cello3d_ros.cli.sources import open_source, with_progress
-from cello3d_ros.errors import RecordingError
+from cello3d_ros.errors import NoRecordingError, RecordingError
 
 
 def is_recording(path: Path) -> bool:
@@ -18,8 +18,10 @@ def is_recording(path: Path) -> bool:
 
     try:
         kind_of(path)
-    except RecordingError as error:
-        return "no recording" not in str(error)
+    except NoRecordingError:
+        return False
+    except RecordingError:
+        pass
     return True
 
 

@@ -73,7 +73,7 @@ def estimate(
         raise ModelError(f"the model was trained with {model.pipeline.grid}, not {pipeline.grid}")
     if registration is None:
         registration = register(reading, reference, T_init, pipeline.icp, rng)
-    if registration.reason not in ("", "max_iterations"):
+    if not registration.has_answer:
         raise RegistrationError(f"ICP has no answer: {registration.reason.replace('_', ' ')}")
     T_ref_read = registration.T_ref_read
     n_rotations = 1 if _looks_at_descriptor(model) else 0

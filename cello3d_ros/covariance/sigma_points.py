@@ -79,5 +79,5 @@ def registered_from(
     results = register_many(
         reading, reference, T_hat @ exp(starts), seeds, pipeline.icp, n_threads
     )
-    answers = [r.T_ref_read for r in results if r.reason in ("", "max_iterations")]
+    answers = [r.T_ref_read for r in results if r.has_answer]
     return log(inverse(T_hat) @ np.array(answers).reshape(-1, 4, 4))

@@ -242,9 +242,7 @@ def register_block(
     else:
         results = register_many(reading, reference, T_inits, seeds, pipeline.icp, n_threads)
     answers = [
-        result
-        for result in results
-        if result.reason in ("", "max_iterations") and np.isfinite(result.T_ref_read).all()
+        result for result in results if result.has_answer and np.isfinite(result.T_ref_read).all()
     ]
     T_found = np.array([result.T_ref_read for result in answers]).reshape(-1, 4, 4)
     return Block(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cello3d_ros.errors import RecordingError
+from cello3d_ros.errors import NoRecordingError, RecordingError
 
 if TYPE_CHECKING:
     from cello3d_ros.geometry.se3 import Array
@@ -60,7 +60,7 @@ def open_recording(
 
 
 def kind_of(path: Path) -> str:
-    """Return what recording is at a path.  Raises RecordingError if it is none."""
+    """Return what recording is at a path.  Raises NoRecordingError if it is none."""
     if (path / "velodyne").is_dir():
         return "KITTI folder"
     if path.suffix in _BAGS or (path / "metadata.yaml").exists():
@@ -75,7 +75,7 @@ def kind_of(path: Path) -> str:
             return "'Challenging data sets' sequence"
         if clouds_in(path):
             return "folder of clouds"
-    raise RecordingError(
+    raise NoRecordingError(
         f"{path}: no recording; expected a rosbag2 folder (metadata.yaml), a .bag, .mcap or .db3 "
         "file, a KITTI folder (velodyne/), a folder or zip archive with Hokuyo_<i>.csv, or a "
         "folder of .ply, .pcd, .bin, .npy or .csv clouds"

@@ -62,6 +62,11 @@ class Registration(NamedTuple):
     residual_rms_m: float
     n_associations: int
 
+    @property
+    def has_answer(self) -> bool:
+        """Whether the pose means anything: one that ran out of iterations still does."""
+        return self.reason in ("", "max_iterations")
+
 
 class _Pair(NamedTuple):
     """Two sets of points as the kernels want them: about the reference's mean."""

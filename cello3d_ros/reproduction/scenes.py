@@ -93,7 +93,7 @@ def errors(
     """
     seeds = [[seed, k] for k in range(len(starts))]
     found = register_many(reading, reference, exp(starts), seeds, pipeline.icp, n_threads)
-    T = [r.T_ref_read for r in found if r.reason in ("", "max_iterations")]
+    T = [r.T_ref_read for r in found if r.has_answer]
     return np.asarray(log(np.array(T).reshape(-1, 4, 4)))
 
 

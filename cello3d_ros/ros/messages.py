@@ -11,11 +11,10 @@ from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2, PointField
 
-from cello3d_ros.errors import ConfigError
+from cello3d_ros.errors import ConfigError, CovarianceError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import to_fixed_axes
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.tracking.covariances import CovarianceError as CovarianceError
 from cello3d_ros.tracking.covariances import ros_covariance as ros_covariance
 from cello3d_ros.tracking.odometry import checked_pose
 

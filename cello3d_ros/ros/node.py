@@ -43,7 +43,7 @@ from cello3d_ros.ros.messages import tf_message
 from cello3d_ros.ros.outputs import Outputs
 from cello3d_ros.ros.worker import Worker
 from cello3d_ros.tracking.intake import JUMP_NS, Job, Skip
-from cello3d_ros.tracking.tracker import Answer, reason_of
+from cello3d_ros.tracking.tracker import Answer
 from cello3d_ros.tracking.warmup import warm_up
 
 _PATIENCE_S = 0.05  # longest time for which work is put off to hear what came before it
@@ -229,7 +229,7 @@ class CovarianceNode(ManagedNode):
             else:
                 self._publish(job, answer)
         except Cello3dError as error:
-            self._skip(Skip(job.stamp_ns, reason_of(error), str(error)))
+            self._skip(Skip(job.stamp_ns, error.reason, str(error)))
         except Exception as error:  # a node that dies of one cloud is worse than a lost answer
             if not self.context.ok():
                 raise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cello3d_ros.errors import Cello3dError
+from cello3d_ros.errors import CovarianceError
 from cello3d_ros.geometry.gaussian import symmetrized, to_fixed_axes
 from cello3d_ros.geometry.se3 import Array
 
@@ -12,10 +12,6 @@ N_SIGMA = 3.0  # of what is shown and judged
 
 _CONDITION = 1e-13  # least ratio of eigenvalues that still is positive definite when rounded
 _HUGE = 1e12  # times the ceiling: beyond it a covariance is scaled down, so that nothing overflows
-
-
-class CovarianceError(Cello3dError):
-    """A covariance cannot be published."""
 
 
 def ros_covariance(

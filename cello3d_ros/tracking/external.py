@@ -18,6 +18,8 @@ from cello3d_ros.registration.icp import Registration
 class DisagreementError(RegistrationError):
     """Another program's pose is not where ICP would leave it."""
 
+    reason = "external_disagrees"
+
 
 class External(NamedTuple):
     """A pose as a registration.  offset: (6,), the twist by which ICP would move it."""
@@ -46,7 +48,7 @@ def checked(
     if limit <= 0.0:
         return External(registration, np.zeros(6))
     found = register(reading, reference, T_ref_read, config, rng)
-    if found.reason not in ("", "max_iterations"):
+    if not found.has_answer:
         raise RegistrationError(f"ICP has no answer: {found.reason.replace('_', ' ')}")
     offset = log(inverse(T_ref_read) @ found.T_ref_read)
     way_m, angle_rad = np.linalg.norm(offset[:3]), np.linalg.norm(offset[3:])

@@ -17,7 +17,7 @@ from cello3d_ros.recordings.odometry import with_odometry
 from cello3d_ros.recordings.recording import Recording, Scan
 from cello3d_ros.tracking.guess import EXTERNAL, ODOMETRY, Locator, Place
 from cello3d_ros.tracking.odometry import OdometryBuffer, OdometryError, PoseSource
-from cello3d_ros.tracking.tracker import Answer, Tracker, reason_of
+from cello3d_ros.tracking.tracker import Answer, Tracker
 
 
 class Step(NamedTuple):
@@ -43,7 +43,7 @@ def _step(scan: Scan, place: Place, tracker: Tracker) -> Step:
     try:
         answer = tracker.step(scan.stamp_ns, scan.points, place)
     except Cello3dError as error:
-        return Step(scan, None, reason_of(error), str(error))
+        return Step(scan, None, error.reason, str(error))
     return Step(scan, answer, "" if answer is not None else "reference")
 
 

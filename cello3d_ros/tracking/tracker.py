@@ -16,11 +16,10 @@ from cello3d_ros.config import NodeConfig, Pipeline
 from cello3d_ros.covariance.estimator import Estimate, estimate, needs_shape
 from cello3d_ros.covariance.methods import METHODS, MethodSettings
 from cello3d_ros.covariance.model import Model
-from cello3d_ros.errors import CloudError, ModelError, NoOverlapError, RegistrationError
+from cello3d_ros.errors import ModelError, NotConvergedError, RegistrationError
 from cello3d_ros.geometry.gaussian import GaussianPose, compound_right, is_positive_definite
 from cello3d_ros.geometry.se3 import Array, inverse
-from cello3d_ros.tracking.covariances import CovarianceError
-from cello3d_ros.tracking.external import DisagreementError, External, checked
+from cello3d_ros.tracking.external import External, checked
 from cello3d_ros.tracking.frames import seen_from_base
 from cello3d_ros.tracking.guess import CONSTANT_VELOCITY, EXTERNAL, ODOMETRY, Motion, Place
 from cello3d_ros.tracking.pairing import Frame, Link, Map, makes_keyframe
@@ -33,20 +32,22 @@ _MAX_TURN2_RAD2 = 3.0  # one radian about each axis
 _N_THREADS = min(os.cpu_count() or 1, 4)  # more than that is not worth starting
 
 
-class NotConvergedError(RegistrationError):
-    """ICP stopped before it settled."""
-
-
 class TooFarApartError(RegistrationError):
     """Two scans are too far apart in time to be a pair."""
+
+    reason = "too_far_apart"
 
 
 class BrokenChainError(RegistrationError):
     """Frames or odometry have changed, so that a scan cannot be paired with those before it."""
 
+    reason = "broken_chain"
+
 
 class NoReferenceError(RegistrationError):
     """No reference cloud has come."""
+
+    reason = "no_reference"
 
 
 @dataclass(frozen=True)
@@ -321,23 +322,6 @@ class Tracker:
     def _begin(self, link: Link) -> None:
         self._reference = self._latest = link
         self._motion.add(link.frame.stamp_ns, link.T)
-
-
-def reason_of(error: Exception) -> str:
-    """Return the short name under which a failure is counted."""
-    names = {
-        NotConvergedError: "not_converged",
-        TooFarApartError: "too_far_apart",
-        BrokenChainError: "broken_chain",
-        NoReferenceError: "no_reference",
-        DisagreementError: "external_disagrees",
-        NoOverlapError: "no_overlap",
-        RegistrationError: "registration",
-        ModelError: "beyond_model",
-        CloudError: "too_few_points",
-        CovarianceError: "covariance",
-    }
-    return next((name for kind, name in names.items() if isinstance(error, kind)), "internal")
 
 
 def _broken(before: Place, now: Place) -> str:

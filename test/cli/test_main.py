@@ -43,7 +43,7 @@ def test_estimate_prints_the_pose_and_both_covariances(files, capsys):
     assert answer["iterations"] > 0
     assert 0.5 < answer["overlap_ratio"] <= 1.0
     assert answer["nearest_rho"] >= 0.0
-    assert answer["effective_neighbours"] == 1.0
+    assert answer["effective_neighbors"] == 1.0
 
 
 def test_estimate_is_by_the_method_that_is_named(files, capsys):

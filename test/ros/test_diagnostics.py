@@ -11,12 +11,20 @@ pytest.importorskip("rclpy")
 
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.covariance.estimator import Estimate
+from cello3d_ros.errors import (
+    Cello3dError,
+    CloudError,
+    CovarianceError,
+    ModelError,
+    RegistrationError,
+)
 from cello3d_ros.geometry import se3
 from cello3d_ros.registration.icp import Registration
 from cello3d_ros.ros.diagnostics import ERROR, OK, WARN, Statistics, Verdict, judged
 from cello3d_ros.tracking.tracker import Answer
 
 ROOT = Path(__file__).parents[2]
+SOURCES = ROOT / "cello3d_ros"
 PAGE = (ROOT / "docs" / "diagnostics.md").read_text()
 CONFIG = NodeConfig(max_failures=3)
 
@@ -69,10 +77,19 @@ def test_the_page_names_every_key_and_no_other(statistics) -> None:
     }
 
 
+def errors_of_the_tracker() -> list[type[Cello3dError]]:
+    """Every error class with which a pair can end without an answer."""
+    found: list[type[Cello3dError]] = [CloudError, RegistrationError, ModelError, CovarianceError]
+    for kind in found:
+        found += kind.__subclasses__()
+    return found
+
+
 def reasons() -> set[str]:
     """Every reason that a cloud can be skipped for, as written in the sources."""
-    found = set()
-    for path in (ROOT / "cello3d_ros" / "ros").glob("*.py"):
+    found = {"internal", *(kind.reason for kind in errors_of_the_tracker())}
+    files = [path for room in ("ros", "tracking") for path in (SOURCES / room).glob("*.py")]
+    for path in files:
         for node in ast.walk(ast.parse(path.read_text())):
             words: list[ast.AST] = []
             if isinstance(node, ast.Call):
@@ -81,10 +98,10 @@ def reasons() -> set[str]:
                 words = [node.args[0]] if name == "self._forget" else words
             elif isinstance(node, ast.Subscript) and ast.unparse(node.value) == "self.dropped":
                 words = [node.slice]
-            elif isinstance(node, ast.FunctionDef) and node.name in ("reason_of", "stamp_order"):
+            elif isinstance(node, ast.FunctionDef) and node.name == "stamp_order":
                 words = list(ast.walk(node))
             found |= {word.value for word in words if isinstance(word, ast.Constant)}
-    worker = (ROOT / "cello3d_ros" / "ros" / "worker.py").read_text()
+    worker = (SOURCES / "ros" / "worker.py").read_text()
     waited_for = re.search(r'what = "([a-z ]+)" if .* else "([a-z ]+)"', worker)
     assert waited_for
     found |= {f"no_{what.replace(' ', '_')}" for what in waited_for.groups()}  # Intake

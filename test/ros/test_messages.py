@@ -7,6 +7,7 @@ pytest.importorskip("rclpy")
 
 from scipy.spatial.transform import Rotation
 
+from cello3d_ros.errors import CovarianceError
 from cello3d_ros.geometry import se3
 from cello3d_ros.ros import messages
 from cello3d_ros.tracking.odometry import OdometryError
@@ -83,9 +84,9 @@ def test_a_covariance_within_the_bounds_is_only_turned() -> None:
 def test_a_covariance_that_is_not_finite_is_refused() -> None:
     Y = np.eye(6)
     Y[2, 3] = np.nan
-    with pytest.raises(messages.CovarianceError, match="not finite"):
+    with pytest.raises(CovarianceError, match="not finite"):
         messages.ros_covariance(Y, np.eye(3), *LIMITS)
-    with pytest.raises(messages.CovarianceError, match="not finite"):
+    with pytest.raises(CovarianceError, match="not finite"):
         messages.pose_with_covariance(0, "lidar", np.eye(4), Y)
 
 

@@ -9,6 +9,7 @@ from consumer_rules import of_pose, of_twist
 
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.covariance.estimator import Estimate
+from cello3d_ros.errors import CovarianceError
 from cello3d_ros.geometry import se3
 from cello3d_ros.registration.icp import Registration
 from cello3d_ros.ros import messages, outputs
@@ -62,12 +63,12 @@ def test_odometry_is_taken_by_its_consumers_whatever_the_covariance(Y_step, dt_n
 def test_what_is_not_finite_is_refused(bad: float) -> None:
     Y_bad = Y.copy()
     Y_bad[1, 1] = bad
-    with pytest.raises(messages.CovarianceError):
+    with pytest.raises(CovarianceError):
         outputs._twist(answer(Y_step=Y_bad), NodeConfig())
-    with pytest.raises(messages.CovarianceError):
+    with pytest.raises(CovarianceError):
         outputs._pose(1, "odom", STEP, Y_bad, NodeConfig())
     pose = outputs._pose(1, "odom", STEP, Y, NodeConfig())
-    with pytest.raises(messages.CovarianceError):
+    with pytest.raises(CovarianceError):
         messages.full_odometry(pose, "lidar", np.full(6, bad), Y)
 
 

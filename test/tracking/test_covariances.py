@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from consumer_rules import complaints, floored
 
+from cello3d_ros.errors import CovarianceError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import sampled_covariance
-from cello3d_ros.tracking.covariances import CovarianceError, ros_covariance, twist_covariance
+from cello3d_ros.tracking.covariances import ros_covariance, twist_covariance
 
 R = se3.exp([0, 0, 0, 0.3, -0.5, 1.0])[:3, :3]
 FLOORS = [(1e-4, 1e-5), (1e-9, 1e-9), (1e-2, 1e-9), (40.0, 1e-3)]

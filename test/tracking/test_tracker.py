@@ -8,23 +8,20 @@ from cello3d_ros.config import Config, NodeConfig
 from cello3d_ros.covariance import estimator
 from cello3d_ros.covariance.estimator import Estimate
 from cello3d_ros.covariance.model import constant_model, load_model, shipped_model_path
-from cello3d_ros.errors import CloudError, NoOverlapError
+from cello3d_ros.errors import CloudError, CovarianceError, NoOverlapError, NotConvergedError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import compound_right, is_positive_definite
 from cello3d_ros.registration.icp import Registration
 from cello3d_ros.tracking import external as external_module
 from cello3d_ros.tracking import pairing
 from cello3d_ros.tracking import tracker as module
-from cello3d_ros.tracking.covariances import CovarianceError
 from cello3d_ros.tracking.external import DisagreementError
 from cello3d_ros.tracking.guess import Place
 from cello3d_ros.tracking.tracker import (
     BrokenChainError,
     NoReferenceError,
-    NotConvergedError,
     TooFarApartError,
     Tracker,
-    reason_of,
 )
 from cello3d_ros.tracking.warmup import room
 
@@ -252,11 +249,10 @@ def test_the_same_scans_give_the_same_answers_whatever_came_before(tracker) -> N
 
 
 def test_reasons_are_the_narrowest_name() -> None:
-    assert reason_of(NoOverlapError()) == "no_overlap"
-    assert reason_of(NotConvergedError()) == "not_converged"
-    assert reason_of(TooFarApartError()) == "too_far_apart"
-    assert reason_of(CloudError()) == "too_few_points"
-    assert reason_of(ValueError()) == "internal"
+    assert NoOverlapError().reason == "no_overlap"
+    assert NotConvergedError().reason == "not_converged"
+    assert TooFarApartError().reason == "too_far_apart"
+    assert CloudError().reason == "too_few_points"
 
 
 def tracker_with(**settings) -> Tracker:
@@ -423,7 +419,7 @@ def test_an_external_pose_that_icp_would_move_far_is_refused() -> None:
     far = se3.exp([0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
     with pytest.raises(DisagreementError, match=r"by 0\.\d+ m and .* more than 0\.2") as caught:
         external(tracker_with(registration="external", max_external_offset=0.2), far)
-    assert reason_of(caught.value) == "external_disagrees"
+    assert caught.value.reason == "external_disagrees"
 
 
 def test_at_the_base_the_chain_is_that_of_the_base(asked) -> None:
@@ -517,4 +513,4 @@ def test_a_chain_grows_by_its_steps_and_not_by_itself(scale: float) -> None:
 
 
 def test_a_covariance_that_cannot_be_published_has_a_reason_of_its_own() -> None:
-    assert reason_of(CovarianceError("not finite")) == "covariance"
+    assert CovarianceError("not finite").reason == "covariance"
