@@ -14,9 +14,9 @@ from rosbags.typesys import Stores, get_typestore
 from cello3d_ros.clouds.point_times import INTENSITIES, NAMES, TimeLaw, recognise, relative_s
 from cello3d_ros.clouds.pointcloud2 import read_fields
 from cello3d_ros.errors import Cello3dError, RecordingError
-from cello3d_ros.geometry.pose_track import PoseTrack
+from cello3d_ros.geometry.pose_track import PoseError, PoseTrack, checked_pose
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.geometry.transforms import PoseLog, TransformTree
+from cello3d_ros.geometry.transforms import NotConnectedError, TransformTree
 from cello3d_ros.recordings.bag_writer import write_bag
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.recordings.topics import POSE_TYPES, TF_STATIC, TF_TYPES, choose
@@ -30,7 +30,6 @@ class _Poses:
     """What a bag says of poses: tracks by topic, the frames they are of, and transforms."""
 
     def __init__(self) -> None:
-        self.logs: dict[str, PoseLog] = {}
         self.tracks: dict[str, PoseTrack] = {}
         self.child_frames: dict[str, str] = {}
         self.tree = TransformTree()
@@ -127,8 +126,12 @@ class BagRecording:
         if self._frames is None:
             return self._pose(self.topics.ground_truth, stamp_ns, frame)
         tree = self._read_poses().tree
-        T = tree.at(*self._frames, stamp_ns)
-        return None if T is None else T @ self._moved(self._frames[1], frame)
+        try:
+            return tree.at(*self._frames, stamp_ns) @ self._moved(self._frames[1], frame)
+        except NotConnectedError:
+            raise
+        except PoseError:
+            return None
 
     def _pose(self, topic: str | None, stamp_ns: int, frame: str) -> Array | None:
         if topic is None:
@@ -143,7 +146,7 @@ class BagRecording:
     def _moved(self, base: str, frame: str) -> Array:
         if self._T_base_sensor is not None:
             return self._T_base_sensor
-        T = None if base == frame else self._read_poses().tree.static(base, frame)
+        T = None if base == frame else self._read_poses().tree.constant(base, frame)
         return np.eye(4) if T is None else T
 
     def _read_poses(self) -> _Poses:
@@ -151,20 +154,23 @@ class BagRecording:
         if self._poses is None:
             poses = _Poses()
             wanted = {t for t in self.topics[1:] if t is not None}
-            poses.logs = {t: PoseLog() for t in wanted}
+            poses.tracks = {t: PoseTrack() for t in wanted}
+            n_read = dict.fromkeys(wanted, 0)
             for topic, stamp_ns, message in self._messages(wanted | self._tf_topics()):
                 with _one_sentence(self.path, f"{topic}: "):
                     if topic in wanted:
-                        poses.logs[topic].add(stamp_ns, *POSE_TYPES[self.types[topic]](message))
+                        T = checked_pose(*POSE_TYPES[self.types[topic]](message))
+                        poses.tracks[topic].add(stamp_ns, T)
+                        n_read[topic] += 1
                         if child := getattr(message, "child_frame_id", ""):
                             poses.child_frames.setdefault(topic, child)
                     else:
-                        poses.tree.add(message, static=topic.endswith(TF_STATIC))
+                        for sentence in poses.tree.add(message, topic.endswith(TF_STATIC)):
+                            raise RecordingError(sentence)
             for t in wanted:
                 with _one_sentence(self.path, f"{t}: "):
-                    if (n := len(poses.logs[t])) < self.counts[t]:
+                    if (n := n_read[t]) < self.counts[t]:
                         raise RecordingError(f"ends early, after {n} of {self.counts[t]} poses")
-                    poses.tracks[t] = poses.logs[t].track()
             self._poses = poses
         return self._poses
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cello3d_ros.errors import RecordingError
-from cello3d_ros.geometry.pose_track import PoseTrack
+from cello3d_ros.geometry.pose_track import PoseError, PoseTrack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings import tables
 from cello3d_ros.recordings.files import READERS, read_columns, scan_of
@@ -166,8 +166,8 @@ def _named_stamp(file: Path) -> int | None:
 
 def _track(found: StampedRows, path: Path) -> PoseTrack:
     try:
-        return PoseTrack(*found)
-    except RecordingError as error:
+        return PoseTrack.of_rows(*found)
+    except PoseError as error:
         raise RecordingError(f"{path}: {error}") from None
 
 

@@ -14,9 +14,9 @@ from sensor_msgs.msg import PointCloud2, PointField
 from cello3d_ros.errors import ConfigError, CovarianceError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import to_fixed_axes
+from cello3d_ros.geometry.pose_track import checked_pose
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.tracking.covariances import ros_covariance as ros_covariance
-from cello3d_ros.tracking.odometry import checked_pose
 
 
 def stamp_ns_of(message: Any) -> int:
@@ -38,9 +38,8 @@ def duration_of(seconds: float) -> Duration:
 
 
 def pose_from(pose: Pose) -> Array:
-    """Return a geometry_msgs/Pose as a (4, 4) matrix.  Raises OdometryError when damaged."""
-    p, q = pose.position, pose.orientation
-    return checked_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+    """Return a geometry_msgs/Pose as a (4, 4) matrix.  Raises PoseError when damaged."""
+    return checked_pose(pose.position, pose.orientation)
 
 
 def pose_to(T: Array) -> Pose:

@@ -18,12 +18,13 @@ from cello3d_ros.clouds.pointcloud2 import read_points
 from cello3d_ros.config import Config
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import CloudError
+from cello3d_ros.geometry.pose_track import PoseError, PoseTrack
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.geometry.transforms import TransformTree
 from cello3d_ros.ros import messages
-from cello3d_ros.tracking.frames import TransformBuffer
 from cello3d_ros.tracking.guess import Locator
 from cello3d_ros.tracking.intake import JUMP_NS, Intake, Job, Skip, stamp_order
-from cello3d_ros.tracking.odometry import OdometryBuffer, OdometryError, PoseSource
+from cello3d_ros.tracking.odometry import PoseSource
 from cello3d_ros.tracking.tracker import Answer, Tracker
 
 MAX_CLOUD_BYTES = 64 * 1024**2  # of a message on points: work takes up to 30 times its size
@@ -50,9 +51,9 @@ class Worker:
         self._skip, self._warn = skip, warn
         length_s, gap_s = node.odometry_buffer_s, node.odometry_gap_s
         what = "external pose" if node.registration == "external" else "odometry"
-        self._poses = OdometryBuffer(length_s, gap_s, what=what)
+        self._poses = PoseTrack(gap_s, length_s, 100_000, what)
         self._source = PoseSource(self._poses)
-        self._transforms = TransformBuffer(length_s, gap_s) if node.use_tf else None
+        self._transforms = TransformTree(gap_s, length_s) if node.use_tf else None
         self._locator = Locator(node, self._source, self._transforms)
         self._intake = Intake(self._locator.place, node.odometry_timeout_s, what)
         self._newest_cloud_ns: int | None = None
@@ -98,7 +99,7 @@ class Worker:
             fastest = self.config.node.max_odometry_speed_m_s
             if broken := self._source.hear(stamp_ns, T, *frames, fastest):
                 self._warn("broken_chain", f"{broken}: the chain starts again")
-        except OdometryError as error:
+        except PoseError as error:
             self._warn("odometry", f"{what} message rejected: {error}")
             return False
         return True
@@ -106,7 +107,7 @@ class Worker:
     def hear_transforms(self, message: Any, static: bool) -> None:
         """Remember the transforms of a tf2_msgs/TFMessage."""
         if self._transforms is not None:
-            for sentence in self._transforms.hear(message, static):
+            for sentence in self._transforms.add(message, static):
                 self._warn("transform", sentence)
 
     def hear_reference(self, message: PointCloud2) -> None:
@@ -190,7 +191,7 @@ class Worker:
         try:
             self._check_not_in_future(stamp_ns, now_ns)
             points = _points(message, MAX_CLOUD_BYTES)
-        except OdometryError as error:
+        except PoseError as error:
             return Skip(stamp_ns, "future_stamp", str(error))
         except CloudError as error:
             return Skip(stamp_ns, "malformed", str(error))
@@ -206,10 +207,10 @@ class Worker:
         return points
 
     def _check_not_in_future(self, stamp_ns: int, now_ns: int) -> None:
-        """Raise OdometryError for a stamp after now; a simulated clock at 0 has not started."""
+        """Raise PoseError for a stamp after now; a simulated clock at 0 has not started."""
         ahead_s = 1e-9 * (stamp_ns - now_ns)
         if now_ns > 0 and ahead_s > self.config.node.future_tolerance_s:
-            raise OdometryError(f"the stamp is {ahead_s:.3f} s in the future")
+            raise PoseError(f"the stamp is {ahead_s:.3f} s in the future")
 
 
 def _points(message: PointCloud2, max_bytes: int) -> Array:

@@ -8,9 +8,10 @@ import numpy as np
 
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.pose_track import PoseError, PoseNotYetError
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.tracking.frames import TransformBuffer, UnknownFrameError
-from cello3d_ros.tracking.odometry import OdometryError, OdometryNotYetError, PoseSource
+from cello3d_ros.geometry.transforms import TransformTree, UnknownFrameError
+from cello3d_ros.tracking.odometry import PoseSource
 
 ODOMETRY, EXTRAPOLATED, CONSTANT_VELOCITY = "odometry", "extrapolated", "constant_velocity"
 EXTERNAL = "external"
@@ -43,7 +44,7 @@ class Locator:
     """Says where the sensor is, from odometry or the external registration and the extrinsic."""
 
     def __init__(
-        self, config: NodeConfig, source: PoseSource, transforms: TransformBuffer | None = None
+        self, config: NodeConfig, source: PoseSource, transforms: TransformTree | None = None
     ) -> None:
         """source: odometry or external poses.  transforms: /tf, or None for T_base_sensor."""
         self.config = config
@@ -55,7 +56,7 @@ class Locator:
         """Return where the sensor is at a stamp.
 
         is_late: the cloud has waited long enough; what comes later is of no use.  Raises
-        OdometryNotYetError when waiting may help and OdometryMissingError when it will not.
+        PoseNotYetError when waiting may help and PoseMissingError when it will not.
         """
         T_odom_base, guess = self._base(stamp_ns, is_late)
         odom_frame = self.source.frame_id or "odom"
@@ -78,9 +79,9 @@ class Locator:
             return poses.nearest(stamp_ns, config.external_tolerance_s), EXTERNAL
         policy = config.guess_without_odometry
         try:
-            return poses.at(stamp_ns), ODOMETRY
-        except OdometryError as error:
-            may_come = isinstance(error, OdometryNotYetError) and not is_late
+            return poses.pose(stamp_ns), ODOMETRY
+        except PoseError as error:
+            may_come = isinstance(error, PoseNotYetError) and not is_late
             if policy == "skip" or may_come:
                 raise
         if policy == "extrapolate":

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from cello3d_ros.geometry.pose_track import PoseError, PoseNotYetError
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.tracking.frames import UnknownFrameError
+from cello3d_ros.geometry.transforms import UnknownFrameError
 from cello3d_ros.tracking.guess import Place
-from cello3d_ros.tracking.odometry import OdometryError, OdometryNotYetError
 
 JUMP_NS = (
     1_000_000_000  # a stamp that goes back by more than this is a clock set back, a bag looped
@@ -90,8 +90,8 @@ class Intake:
         try:
             for job in self._waiting[-1:]:
                 self._place(job)
-        except OdometryError as error:
-            return not isinstance(error, OdometryNotYetError)
+        except PoseError as error:
+            return not isinstance(error, PoseNotYetError)
         return True
 
     def take(self) -> tuple[Job | None, list[Skip]]:
@@ -101,9 +101,9 @@ class Intake:
             job = self._waiting[i]
             try:
                 job.place = self._place(job)
-            except OdometryNotYetError:
+            except PoseNotYetError:
                 continue
-            except OdometryError as error:
+            except PoseError as error:
                 skips.append(self._without_place(job, error))
                 del self._waiting[i]
                 continue
@@ -127,7 +127,7 @@ class Intake:
             try:
                 self._place(job)
                 kept.append(job)
-            except OdometryError as error:
+            except PoseError as error:
                 skips.append(self._without_place(job, error))
         self._waiting = kept
         return skips
@@ -135,7 +135,7 @@ class Intake:
     def _place(self, job: Job) -> Place:
         return self._locate(job.stamp_ns, job.frame_id, job.waited_s >= self.timeout_s)
 
-    def _without_place(self, job: Job, error: OdometryError) -> Skip:
+    def _without_place(self, job: Job, error: PoseError) -> Skip:
         if isinstance(error, UnknownFrameError):
             return Skip(job.stamp_ns, "unknown_frame", str(error))
         reason = f"no_{self._what.replace(' ', '_')}"

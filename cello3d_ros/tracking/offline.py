@@ -12,11 +12,12 @@ from typing import NamedTuple
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.pose_track import PoseError, PoseTrack
 from cello3d_ros.recordings.bag import BagRecording
 from cello3d_ros.recordings.odometry import with_odometry
 from cello3d_ros.recordings.recording import Recording, Scan
 from cello3d_ros.tracking.guess import EXTERNAL, ODOMETRY, Locator, Place
-from cello3d_ros.tracking.odometry import OdometryBuffer, OdometryError, PoseSource
+from cello3d_ros.tracking.odometry import PoseSource
 from cello3d_ros.tracking.tracker import Answer, Tracker
 
 
@@ -47,14 +48,14 @@ def _step(scan: Scan, place: Place, tracker: Tracker) -> Step:
     return Step(scan, answer, "" if answer is not None else "reference")
 
 
-def _places(
-    recording: Recording, config: NodeConfig
-) -> Iterator[tuple[Scan, Place | OdometryError]]:
+def _places(recording: Recording, config: NodeConfig) -> Iterator[tuple[Scan, Place | PoseError]]:
     """Yield each scan with its place: by a bag's messages as they are, else made of the poses.
 
     They are taken as registrations when ``registration`` is external.
     """
-    source = PoseSource(OdometryBuffer(config.odometry_buffer_s, config.odometry_gap_s))
+    source = PoseSource(
+        PoseTrack(config.odometry_gap_s, config.odometry_buffer_s, what="odometry")
+    )
     locator = Locator(config, source)
     if not isinstance(recording, BagRecording) or recording.topics.odometry is None:
         guess = EXTERNAL if config.registration == "external" else ODOMETRY
@@ -71,5 +72,5 @@ def _places(
             source.hear(*message, "odom", "", config.max_odometry_speed_m_s)
         try:
             yield scan, locator.place(scan.stamp_ns, "lidar", is_late=True)
-        except OdometryError as error:
+        except PoseError as error:
             yield scan, error

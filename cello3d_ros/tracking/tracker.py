@@ -19,8 +19,8 @@ from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import ModelError, NotConvergedError, RegistrationError
 from cello3d_ros.geometry.gaussian import GaussianPose, compound_right, is_positive_definite
 from cello3d_ros.geometry.se3 import Array, inverse
+from cello3d_ros.geometry.transforms import seen_from_base
 from cello3d_ros.tracking.external import External, checked
-from cello3d_ros.tracking.frames import seen_from_base
 from cello3d_ros.tracking.guess import CONSTANT_VELOCITY, EXTERNAL, ODOMETRY, Motion, Place
 from cello3d_ros.tracking.pairing import Frame, Link, Map, makes_keyframe
 

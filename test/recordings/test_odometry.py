@@ -1,11 +1,8 @@
 """Drift has the stated statistics; poses are looked up between recorded ones."""
 
 import numpy as np
-import pytest
 
-from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
-from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.recordings.odometry import drift_odometry
 
 
@@ -68,40 +65,3 @@ def test_ground_truth_is_not_changed_in_place() -> None:
     before = truth.copy()
     drift_odometry(truth, np.random.default_rng(0))
     assert np.array_equal(truth, before)
-
-
-ROWS = [[0, 0, 0, 0, 0, 0, 1], [2, 0, 0, 0, 0, np.sin(0.5), np.cos(0.5)]]
-
-
-def test_a_track_is_interpolated_between_its_poses() -> None:
-    track = PoseTrack([100, 200], ROWS)
-    T = track.at(125)
-    assert np.allclose(T[:3, 3], [0.5, 0, 0])
-    assert np.allclose(se3.log(T)[3:], [0, 0, 0.25])
-
-
-def test_a_track_says_nothing_outside_its_span() -> None:
-    track = PoseTrack([100, 200], ROWS)
-    assert track.at(99) is None
-    assert track.at(201) is None
-    assert np.allclose(track.at(100), np.eye(4))
-    assert np.allclose(track.at(200)[:3, 3], [2, 0, 0])
-    assert PoseTrack([], []).at(0) is None
-
-
-def test_large_stamps_keep_their_nanoseconds() -> None:
-    start = 1_600_000_000_000_000_001
-    track = PoseTrack([start, start + 4], ROWS)
-    assert np.allclose(track.at(start + 1)[:3, 3], [0.5, 0, 0], atol=1e-12)
-
-
-def test_a_track_sorts_its_poses_and_keeps_the_last_of_one_stamp() -> None:
-    track = PoseTrack([200, 100, 200], [ROWS[0], ROWS[0], ROWS[1]])
-    assert [stamp for stamp, _ in track] == [100, 200]
-    assert np.allclose(track.at(200)[:3, 3], [2, 0, 0])
-
-
-@pytest.mark.parametrize("bad", [[np.nan, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 0]])
-def test_a_pose_with_nan_or_a_zero_quaternion_is_named(bad: list[float]) -> None:
-    with pytest.raises(RecordingError, match="pose 1 "):
-        PoseTrack([100, 200], [ROWS[0], bad])

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from cello3d_ros.errors import CovarianceError
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.pose_track import PoseError
 from cello3d_ros.ros import messages
-from cello3d_ros.tracking.odometry import OdometryError
 
 LIMITS = (1e-4, 1e-5, 900.0)
 
@@ -101,7 +101,7 @@ def test_a_pose_survives_the_message() -> None:
 def test_the_empty_pose_of_a_message_is_valid_and_a_zero_quaternion_is_not() -> None:
     message = messages.odometry_to(0, "odom", "lidar", np.eye(4))
     message.pose.pose.orientation.w = 0.0
-    with pytest.raises(OdometryError, match="zero"):
+    with pytest.raises(PoseError, match="zero"):
         messages.pose_from(message.pose.pose)
 
 

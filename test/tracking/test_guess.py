@@ -7,14 +7,10 @@ import pytest
 
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.geometry import se3
-from cello3d_ros.tracking.frames import TransformBuffer, UnknownFrameError
+from cello3d_ros.geometry.pose_track import PoseMissingError, PoseNotYetError, PoseTrack
+from cello3d_ros.geometry.transforms import TransformTree, UnknownFrameError
 from cello3d_ros.tracking.guess import Locator, Motion
-from cello3d_ros.tracking.odometry import (
-    OdometryBuffer,
-    OdometryMissingError,
-    OdometryNotYetError,
-    PoseSource,
-)
+from cello3d_ros.tracking.odometry import PoseSource
 
 S = 10**9
 STEP = se3.exp([0.5, 0.1, 0.0, 0.02, -0.05, 0.3])
@@ -23,7 +19,7 @@ X = se3.exp([0.2, 0.0, 1.0, 0.0, 0.0, 0.5])
 
 def locator(*poses: tuple[int, np.ndarray], transforms=None, **settings) -> Locator:
     """A locator that has heard some poses of base_link in odom."""
-    source = PoseSource(OdometryBuffer(100.0, 1.0))
+    source = PoseSource(PoseTrack(1.0, 100.0))
     for stamp_ns, T in poses:
         source.hear(stamp_ns, T, "odom", "base_link", 50.0)
     return Locator(NodeConfig(**settings), source, transforms)
@@ -40,12 +36,12 @@ def test_the_sensor_is_where_odometry_and_extrinsic_put_it() -> None:
 @pytest.mark.parametrize("policy", ["skip", "constant_velocity", "extrapolate"])
 def test_odometry_is_waited_for_before_anything_else_is_done(policy) -> None:
     where = locator((S, STEP), (S + S // 2, STEP), guess_without_odometry=policy)
-    with pytest.raises(OdometryNotYetError):
+    with pytest.raises(PoseNotYetError):
         where.place(S + S // 2 + 1, "lidar", is_late=False)
 
 
 def test_skip_without_odometry() -> None:
-    with pytest.raises(OdometryNotYetError):
+    with pytest.raises(PoseNotYetError):
         locator((S, STEP)).place(2 * S, "lidar", is_late=True)
 
 
@@ -73,12 +69,12 @@ def test_extrapolation_carries_on_the_last_twist_of_the_base() -> None:
 @pytest.mark.parametrize("stamp_ns", [S // 2, 2 * S + S // 2])
 def test_extrapolation_has_a_limit_and_does_not_go_back(stamp_ns) -> None:
     where = locator((S, np.eye(4)), (S + S // 2, STEP), guess_without_odometry="extrapolate")
-    with pytest.raises(OdometryMissingError):
+    with pytest.raises(PoseMissingError):
         where.place(stamp_ns, "lidar", is_late=True)
 
 
 def test_one_pose_is_not_extrapolated() -> None:
-    with pytest.raises(OdometryMissingError, match="no two messages"):
+    with pytest.raises(PoseMissingError, match="no two messages"):
         locator((S, STEP), guess_without_odometry="extrapolate").place(S + 1, "lidar", True)
 
 
@@ -87,14 +83,14 @@ def test_an_external_registration_is_taken_at_the_stamp_and_never_interpolated()
     place = where.place(2 * S - 500_000, "lidar", is_late=False)
     np.testing.assert_array_equal(place.T_odom_sensor, STEP)
     assert place.guess == "external"
-    with pytest.raises(OdometryMissingError, match=r"0\.500 s away, more than 0\.001 s"):
+    with pytest.raises(PoseMissingError, match=r"0\.500 s away, more than 0\.001 s"):
         where.place(S + S // 2, "lidar", is_late=False)
-    with pytest.raises(OdometryNotYetError):
+    with pytest.raises(PoseNotYetError):
         where.place(2 * S + 2_000_000, "lidar", is_late=True)
 
 
 def test_the_extrinsic_is_that_of_tf_or_there_is_none() -> None:
-    transforms = TransformBuffer(10.0, 1.0)
+    transforms = TransformTree(1.0, 10.0)
     where = locator((S, STEP), transforms=transforms)
     with pytest.raises(UnknownFrameError, match="'base_link' and 'lidar'"):
         where.place(S, "lidar", is_late=True)
@@ -106,7 +102,7 @@ def test_the_map_is_where_tf_puts_it_or_as_the_answers_say() -> None:
     where = locator((S, STEP))
     where.map_frame = "map"
     assert where.place(S, "lidar", False).T_map_odom is None
-    where.transforms = TransformBuffer(10.0, 1.0)
+    where.transforms = TransformTree(1.0, 10.0)
     _hear(where.transforms, "base_link", "lidar", X)
     with pytest.raises(UnknownFrameError, match="'map' and 'odom'"):
         where.place(S, "lidar", False)
@@ -133,7 +129,7 @@ def test_motion_is_carried_on_at_constant_velocity() -> None:
     np.testing.assert_allclose(motion.at(4 * S), expected, atol=1e-12)
 
 
-def _hear(transforms: TransformBuffer, parent: str, child: str, T: np.ndarray) -> None:
+def _hear(transforms: TransformTree, parent: str, child: str, T: np.ndarray) -> None:
     p, q = T[:3, 3], se3.quaternion(T)
     transform = Message(
         translation=Message(x=p[0], y=p[1], z=p[2]),
@@ -141,4 +137,4 @@ def _hear(transforms: TransformBuffer, parent: str, child: str, T: np.ndarray) -
     )
     header = Message(frame_id=parent, stamp=Message(sec=0, nanosec=0))
     item = Message(header=header, child_frame_id=child, transform=transform)
-    assert transforms.hear(Message(transforms=[item]), True) == []
+    assert transforms.add(Message(transforms=[item]), True) == []

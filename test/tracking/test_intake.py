@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from cello3d_ros.config import NodeConfig
-from cello3d_ros.tracking.frames import TransformBuffer
+from cello3d_ros.geometry.pose_track import PoseTrack
+from cello3d_ros.geometry.transforms import TransformTree
 from cello3d_ros.tracking.guess import Locator
 from cello3d_ros.tracking.intake import Intake, Job, Skip, stamp_order
-from cello3d_ros.tracking.odometry import OdometryBuffer, PoseSource
+from cello3d_ros.tracking.odometry import PoseSource
 
 S = 1_000_000_000
 
@@ -16,14 +17,14 @@ def job(stamp_ns: int) -> Job:
     return Job(stamp_ns, np.empty((0, 3)), "lidar", received_s=0.0)
 
 
-def odometry(*stamps: int) -> OdometryBuffer:
-    buffer = OdometryBuffer(100.0, 1.0)
+def odometry(*stamps: int) -> PoseTrack:
+    buffer = PoseTrack(1.0, 100.0)
     for stamp_ns in stamps:
         buffer.add(stamp_ns, np.eye(4))
     return buffer
 
 
-def intake_of(buffer: OdometryBuffer, timeout_s: float = 0.5, **settings) -> Intake:
+def intake_of(buffer: PoseTrack, timeout_s: float = 0.5, **settings) -> Intake:
     """An intake whose clouds are placed by odometry as the settings have it."""
     source = PoseSource(buffer)
     return Intake(Locator(NodeConfig(**settings), source).place, timeout_s)
@@ -146,7 +147,7 @@ def test_a_cloud_that_can_do_without_odometry_is_taken_when_it_has_waited() -> N
 
 
 def test_a_missing_external_pose_and_an_unknown_frame_are_counted_apart() -> None:
-    poses = OdometryBuffer(100.0, 1.0, what="external pose")
+    poses = PoseTrack(1.0, 100.0, what="external pose")
     where = Locator(NodeConfig(registration="external"), PoseSource(poses))
     intake = Intake(where.place, 0.5, "external pose")
     intake.offer(job(S))
@@ -156,7 +157,7 @@ def test_a_missing_external_pose_and_an_unknown_frame_are_counted_apart() -> Non
         "no external pose at the stamp of the cloud: no external pose has been received",
     )
     poses.add(S, np.eye(4))
-    where.transforms = TransformBuffer(10.0, 1.0)
+    where.transforms = TransformTree(1.0, 10.0)
     intake.offer(job(S))
     (skip,) = intake.expire(0.5)
     assert skip.reason == "unknown_frame"

@@ -7,7 +7,7 @@ import pytest
 
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import sampled_covariance
-from cello3d_ros.tracking.frames import TransformBuffer, UnknownFrameError, seen_from_base
+from cello3d_ros.geometry.transforms import TransformTree, UnknownFrameError, seen_from_base
 
 S = 10**9
 MAST = se3.exp([0.1, 0.2, 1.5, 0.0, 0.1, 0.4])
@@ -35,13 +35,13 @@ def _transform(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> Message
 
 
 @pytest.fixture
-def tree() -> TransformBuffer:
+def tree() -> TransformTree:
     """base_link -> mast (static) -> lidar (static), and base_link -> arm (moving)."""
-    buffer = TransformBuffer(10.0, 1.0)
-    buffer.hear(transforms((0, "base_link", "mast", MAST), (0, "mast", "lidar", HEAD)), True)
+    buffer = TransformTree(1.0, 10.0)
+    buffer.add(transforms((0, "base_link", "mast", MAST), (0, "mast", "lidar", HEAD)), True)
     for k in range(3):
         arm = se3.exp([0.1 * k, 0.0, 0.0, 0.0, 0.0, 0.2 * k])
-        buffer.hear(transforms((k * S, "/base_link", "arm", arm)), False)
+        buffer.add(transforms((k * S, "/base_link", "arm", arm)), False)
     return buffer
 
 
@@ -79,15 +79,15 @@ def test_an_unknown_transform_is_an_error_and_never_the_identity(
 def test_a_transform_that_comes_later_connects(tree) -> None:
     with pytest.raises(UnknownFrameError):
         tree.at("base_link", "camera", 0)
-    tree.hear(transforms((0, "lidar", "camera", HEAD)), True)
+    tree.add(transforms((0, "lidar", "camera", HEAD)), True)
     np.testing.assert_allclose(tree.at("base_link", "camera", 0), MAST @ HEAD @ HEAD)
 
 
 def test_a_frame_has_one_parent_the_last(tree) -> None:
-    tree.hear(transforms((0, "base_link", "lidar", HEAD)), True)
+    tree.add(transforms((0, "base_link", "lidar", HEAD)), True)
     np.testing.assert_allclose(tree.at("base_link", "lidar", 0), HEAD)
     with pytest.raises(UnknownFrameError):
-        TransformBuffer(1.0, 1.0).at("mast", "lidar", 0)
+        TransformTree(1.0, 1.0).at("mast", "lidar", 0)
 
 
 def test_clear_forgets_what_moves_and_keeps_what_does_not(tree) -> None:
@@ -95,7 +95,7 @@ def test_clear_forgets_what_moves_and_keeps_what_does_not(tree) -> None:
     np.testing.assert_allclose(tree.at("base_link", "lidar", 0), MAST @ HEAD)
     with pytest.raises(UnknownFrameError):
         tree.at("base_link", "arm", S)
-    tree.hear(transforms((0, "base_link", "arm", MAST)), False)  # time starts anew
+    tree.add(transforms((0, "base_link", "arm", MAST)), False)  # time starts anew
     np.testing.assert_allclose(tree.at("base_link", "arm", 0), MAST)
 
 
@@ -103,7 +103,7 @@ def test_damaged_transforms_are_rejected_by_name_and_change_nothing(tree) -> Non
     bad = _transform(0, "mast", "lidar", HEAD)
     bad.transform.translation.x = float("nan")
     message = Message(transforms=[bad, _transform(0, "lidar", "lidar", HEAD)])
-    rejected = tree.hear(message, True)
+    rejected = tree.add(message, True)
     assert len(rejected) == 2
     assert "from 'mast' to 'lidar' rejected: the pose is not finite" in rejected[0]
     assert "its own parent" in rejected[1]
@@ -112,9 +112,22 @@ def test_damaged_transforms_are_rejected_by_name_and_change_nothing(tree) -> Non
 
 def test_the_same_transform_twice_is_no_fault(tree) -> None:
     message = transforms((3 * S, "base_link", "arm", MAST))
-    assert tree.hear(message, False) == []
-    assert tree.hear(message, False) == []
-    assert len(tree.hear(transforms((2 * S, "base_link", "arm", MAST)), False)) == 1
+    assert tree.add(message, False) == []
+    assert tree.add(message, False) == []
+
+
+def test_transforms_that_never_change_are_constant_wherever_they_come_from(tree) -> None:
+    np.testing.assert_allclose(tree.constant("base_link", "lidar"), MAST @ HEAD)
+    for k in range(3):  # repeated on /tf, as ROS 1 did
+        tree.add(transforms((k * S, "lidar", "camera", HEAD)), False)
+    np.testing.assert_allclose(tree.constant("base_link", "camera"), MAST @ HEAD @ HEAD)
+    assert tree.constant("base_link", "arm") is None
+    assert tree.constant("base_link", "nowhere") is None
+
+
+def test_a_transform_that_comes_late_is_sorted_in(tree) -> None:
+    assert tree.add(transforms((S // 2, "base_link", "arm", MAST)), False) == []
+    np.testing.assert_allclose(tree.at("base_link", "arm", S // 2), MAST)
 
 
 def test_covariance_at_the_base_is_that_of_sampled_base_poses() -> None:
