@@ -60,5 +60,5 @@ class RecordingError(Cello3dError):
     """A recording cannot be read or written."""
 
 
-class NoRecordingError(RecordingError):
-    """There is no recording at a path."""
+class WriteError(Cello3dError):
+    """A file or folder cannot be written."""

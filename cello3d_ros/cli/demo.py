@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cello3d_ros.atomic import new_file, new_folder
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry.gaussian import mahalanobis, to_fixed_axes
 from cello3d_ros.geometry.se3 import Array, inverse, log
@@ -68,9 +69,10 @@ def run(arguments: argparse.Namespace) -> int:
     summary["model"] = replay.last_status.get("model")
     _write_summary(out / "summary.json", summary)
     if replay.raw:
-        from cello3d_ros.ros.recorder import record
+        from cello3d_ros.recordings.bag_writer import write_raw
 
-        record(out / "bag", replay.raw)
+        with new_folder(out / "bag", replace=True) as folder:
+            write_raw(folder, replay.raw)
         draw(replay, recording.name, out / "trajectory.png")
     print("\n".join(table(summary, recording.name)))
     print(f"\n{out}: summary.json, trajectory.png, bag, node.log")
@@ -171,9 +173,8 @@ def draw(replay: Replay, name: str, path: Path) -> None:
     axes.set(xlabel="x in m", ylabel="y in m", title=f"{name}: top view")
     axes.grid(alpha=0.3)
     axes.legend()
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.png")
-    figure.savefig(temporary)
-    os.replace(temporary, path)
+    with new_file(path) as partial:
+        figure.savefig(partial, format="png")
 
 
 def _draw_ellipses(axes: Any, centers: Array, covariances: list[Array]) -> None:
@@ -272,9 +273,8 @@ def _stopped(node: NodeProcess) -> str | None:
 
 
 def _write_summary(path: Path, summary: dict[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(summary, indent=2) + "\n")
-    os.replace(temporary, path)
+    with new_file(path) as partial:
+        partial.write_text(json.dumps(summary, indent=2) + "\n")
 
 
 def _or_none(function: Any, values: Any) -> float | None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cello3d_ros.atomic import new_file
 from cello3d_ros.errors import Cello3dError, DatasetError, RecordingError
 
 if TYPE_CHECKING:
@@ -177,15 +178,9 @@ def _named(seen: dict[str, str]) -> str:
 
 
 def write_json(path: Path, report: dict[str, Any]) -> None:
-    """Write the report in one piece.  Raises Cello3dError where the disk refuses."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    """Write the report in one piece.  Raises WriteError where the disk refuses."""
+    with new_file(path) as partial:
         partial.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        raise Cello3dError(f"cannot write {path}: {error.strerror or error}") from None
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _words(parser: argparse.ArgumentParser, flag: str, metavar: str, text: str) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cello3d_ros.cli.sources import open_source, with_progress
-from cello3d_ros.errors import NoRecordingError, RecordingError
+from cello3d_ros.errors import RecordingError
 
 
 def is_recording(path: Path) -> bool:
@@ -17,12 +17,9 @@ def is_recording(path: Path) -> bool:
     from cello3d_ros.recordings.opening import kind_of
 
     try:
-        kind_of(path)
-    except NoRecordingError:
-        return False
+        return kind_of(path) is not None
     except RecordingError:
-        pass
-    return True
+        return True
 
 
 def describe_recording(path: Path, arguments: argparse.Namespace) -> dict[str, Any]:

@@ -68,8 +68,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 def write_answers(out: Path, steps: Any, config: NodeConfig) -> Counter[str]:
     """Write the three files as the steps come; return how many clouds met which fate."""
+    from cello3d_ros.atomic import new_folder
     from cello3d_ros.recordings.bag_writer import write_messages
-    from cello3d_ros.recordings.staging import new_folder
 
     counts: Counter[str] = Counter()
     with new_folder(out) as folder, ExitStack() as stack:

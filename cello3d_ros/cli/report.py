@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cello3d_ros.atomic import new_file
 from cello3d_ros.errors import Cello3dError, RecordingError
 
 if TYPE_CHECKING:
@@ -51,14 +51,8 @@ def run(arguments: argparse.Namespace) -> None:
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         told = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise EvaluationError(f"{arguments.evaluation} is damaged: {told}") from None
-    partial = out.with_name(f".{out.name}.{os.getpid()}.tmp")
-    try:
+    with new_file(out) as partial:
         partial.write_text(text, encoding="utf-8")
-        os.replace(partial, out)
-    except OSError as error:
-        raise Cello3dError(f"cannot write {out}: {error.strerror or error}") from None
-    finally:
-        partial.unlink(missing_ok=True)
     print(f"{out}: {len(text.encode()) / 1e6:.1f} MB, {len(clouds)} pairs with clouds")
 
 

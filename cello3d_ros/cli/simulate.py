@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the bags.  Raises RecordingError if a name is taken or Open3D is missing."""
-    from cello3d_ros.recordings.bag import write_bag
+    from cello3d_ros.recordings.bag_writer import write_bag
 
     scanner = changed(SCANNERS[arguments.scanner], arguments.set)
     n_seeds = 1 if arguments.seeds is None else arguments.seeds

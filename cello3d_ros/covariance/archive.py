@@ -7,7 +7,6 @@ header declare is compared with each other and with a bound before anything is a
 from __future__ import annotations
 
 import math
-import os
 import struct
 import tokenize
 import zipfile
@@ -19,6 +18,7 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from cello3d_ros.atomic import new_file
 from cello3d_ros.errors import ModelError
 
 MAX_BYTES = 2 * 1024**3  # all items of one file, uncompressed
@@ -33,22 +33,14 @@ _DAMAGE = (  # what zipfile, zlib and numpy's header parser raise on nonsense
 def write_arrays(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write the arrays to ``path``, compressed; the old file stays until the new is complete.
 
-    Raises ModelError where the disk refuses or ``read_arrays`` would: beyond MAX_BYTES.
+    Raises WriteError where the disk refuses, ModelError beyond MAX_BYTES, which ``read_arrays``
+    would refuse.
     """
     path = Path(path)
     if (size := sum(array.nbytes for array in arrays.values())) > MAX_BYTES - 1024 * len(arrays):
         raise ModelError(f"cannot write {path}: {size} bytes are more than {MAX_BYTES}")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as stream:
-            _write(stream, arrays)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise ModelError(f"cannot write {path}: {error.strerror or error}") from None
-    finally:
-        temporary.unlink(missing_ok=True)
+    with new_file(path) as partial, partial.open("wb") as stream:
+        _write(stream, arrays)
 
 
 def read_arrays(

@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import importlib.metadata
 import json
-import os
 import platform
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,10 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cello3d_ros.atomic import new_file
 from cello3d_ros.config import Pipeline, SamplingConfig, config_from, config_to, pipeline_of
 from cello3d_ros.covariance.archive import read_arrays, write_arrays
 from cello3d_ros.covariance.features import FEATURES
-from cello3d_ros.errors import ConfigError, DatasetError, ModelError
+from cello3d_ros.errors import ConfigError, DatasetError, ModelError, WriteError
 from cello3d_ros.geometry.gaussian import is_positive_definite
 from cello3d_ros.geometry.se3 import Array
 
@@ -170,14 +170,17 @@ class Dataset:
         return record
 
     def write(self, record: PairRecord) -> None:
-        """Store one record, in place of an older one.  Raises DatasetError on unfit values."""
+        """Store one record, in place of an older one.
+
+        Raises DatasetError on unfit values, WriteError where the disk refuses.
+        """
         path = self._file(*record.key)
         try:
             _check(record)
             path.parent.mkdir(exist_ok=True)
             write_arrays(path, _packed(record))
         except OSError as error:
-            raise DatasetError(f"cannot write {path}: {error.strerror}") from None
+            raise WriteError(f"cannot write {path}: {error.strerror}") from None
         except ModelError as error:
             raise DatasetError(str(error)) from None
         except (ValueError, TypeError) as error:
@@ -276,17 +279,8 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 def _write_manifest(path: Path, manifest: dict[str, Any]) -> None:
     text = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
-    partial = path / f".manifest.json.{os.getpid()}.tmp"
-    try:
-        with open(partial, "w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(partial, path / "manifest.json")
-    except OSError as error:
-        raise DatasetError(f"cannot write {path / 'manifest.json'}: {error.strerror}") from None
-    finally:
-        partial.unlink(missing_ok=True)
+    with new_file(path / "manifest.json") as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def _packed(record: PairRecord) -> dict[str, NDArray[Any]]:

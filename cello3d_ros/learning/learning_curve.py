@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from cello3d_ros.errors import Cello3dError
+from cello3d_ros.atomic import new_file
 
 
 def plot_learning_curve(
@@ -15,7 +14,7 @@ def plot_learning_curve(
     """Write a PNG of training loss and of what Theta was judged by, over the iterations.
 
     curve: (iteration, training loss, judged) as ``Training.curve``.  judged_by: name of the
-    latter.  Raises Cello3dError where the file cannot be written.
+    latter.  Raises WriteError where the file cannot be written.
     """
     from matplotlib.figure import Figure
 
@@ -28,11 +27,5 @@ def plot_learning_curve(
     axes.set(xlabel="iteration", ylabel="loss")
     axes.grid(alpha=0.3)
     axes.legend()
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with new_file(path) as partial:
         figure.savefig(partial, format="png", metadata={"Software": None})
-        os.replace(partial, path)
-    except OSError as error:
-        raise Cello3dError(f"cannot write {path}: {error.strerror or error}") from None
-    finally:
-        partial.unlink(missing_ok=True)

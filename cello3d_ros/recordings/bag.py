@@ -17,11 +17,10 @@ from cello3d_ros.errors import Cello3dError, RecordingError
 from cello3d_ros.geometry.pose_track import PoseError, PoseTrack, checked_pose
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.geometry.transforms import NotConnectedError, TransformTree
-from cello3d_ros.recordings.bag_writer import write_bag
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.recordings.topics import POSE_TYPES, TF_STATIC, TF_TYPES, choose
 
-__all__ = ["BagRecording", "write_bag"]
+__all__ = ["BagRecording"]
 
 _ENDINGS = (".bag", ".mcap", ".db3")
 

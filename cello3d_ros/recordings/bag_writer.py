@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,13 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from cello3d_ros.atomic import new_folder
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings.bag_messages import Messages
 from cello3d_ros.recordings.mcap_checksums import add_checksums
 from cello3d_ros.recordings.recording import Scan
-from cello3d_ros.recordings.staging import new_folder
 from cello3d_ros.recordings.topics import (
     CLOUD_TYPE,
     GROUND_TRUTH,
@@ -61,8 +62,8 @@ def write_bag(
 
     provenance: kept as custom data in metadata.yaml.  storage: "mcap" or "sqlite3".
     double: x, y, z as float64, which RViz does not show.
-    The folder appears under its name when it is complete.  Raises RecordingError when there is
-    something of that name, no scan, a stamp that does not follow, or no room to write.
+    The folder appears under its name when it is complete.  Raises RecordingError when there is no
+    scan or a stamp does not follow, WriteError when there is something of that name or no room.
     """
     path = Path(path)
     counts = {POINTS: 0}
@@ -80,19 +81,39 @@ def write_messages(
     provenance: Mapping[str, str] | None = None,
     storage: str = "mcap",
 ) -> None:
-    """Write messages (topic, time in ns, message) into a rosbag2 folder."""
+    """Write messages (topic, time in ns, message) of rosbags' types into a rosbag2 folder."""
+    serialize = get_typestore(Stores.ROS2_JAZZY).serialize_cdr
+    raw = (
+        (topic, message.__msgtype__, stamp_ns, serialize(message, message.__msgtype__))
+        for topic, stamp_ns, message in messages
+    )
+    write_raw(folder, raw, provenance, storage)
+
+
+def write_raw(
+    folder: Path,
+    messages: Iterable[tuple[str, str, int, bytes | memoryview]],
+    provenance: Mapping[str, str] | None = None,
+    storage: str = "mcap",
+) -> None:
+    """Write messages (topic, ROS type, time in ns, CDR bytes) into a rosbag2 folder.
+
+    Raises OSError where the disk refuses.
+    """
     typestore = get_typestore(Stores.ROS2_JAZZY)
     connections: dict[str, Any] = {}
-    with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
-        for key, value in (provenance or {}).items():
-            writer.set_custom_data(key, value)
-        for topic, stamp_ns, message in messages:
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(
-                    topic, kind, typestore=typestore, offered_qos_profiles=[_qos(topic)]
-                )
-            writer.write(connections[topic], stamp_ns, typestore.serialize_cdr(message, kind))
+    try:
+        with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+            for key, value in (provenance or {}).items():
+                writer.set_custom_data(key, value)
+            for topic, kind, time_ns, data in messages:
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(
+                        topic, kind, typestore=typestore, offered_qos_profiles=[_qos(topic)]
+                    )
+                writer.write(connections[topic], time_ns, data)
+    except sqlite3.Error as error:
+        raise OSError(str(error)) from error
     for file in folder.glob("*.mcap"):
         add_checksums(file)
 

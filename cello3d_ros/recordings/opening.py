@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cello3d_ros.errors import NoRecordingError, RecordingError
+from cello3d_ros.errors import RecordingError
 
 if TYPE_CHECKING:
     from cello3d_ros.geometry.se3 import Array
@@ -36,6 +36,12 @@ def open_recording(
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder")
     kind = kind_of(path)
+    if kind is None:
+        raise RecordingError(
+            f"{path}: no recording; expected a rosbag2 folder (metadata.yaml), a .bag, .mcap or "
+            ".db3 file, a KITTI folder (velodyne/), a folder or zip archive with Hokuyo_<i>.csv, "
+            "or a folder of .ply, .pcd, .bin, .npy or .csv clouds"
+        )
     if kind != "ROS bag" and bag_options:
         raise RecordingError(f"{path}: a {kind} has no topics to choose from")
     if kind != "folder of clouds" and poses is not None:
@@ -59,8 +65,11 @@ def open_recording(
     return ChallengingRecording(path)
 
 
-def kind_of(path: Path) -> str:
-    """Return what recording is at a path.  Raises NoRecordingError if it is none."""
+def kind_of(path: Path) -> str | None:
+    """Return what recording is at a path, None if it is none.
+
+    Raises RecordingError for a zip archive that is damaged.
+    """
     if (path / "velodyne").is_dir():
         return "KITTI folder"
     if path.suffix in _BAGS or (path / "metadata.yaml").exists():
@@ -75,8 +84,4 @@ def kind_of(path: Path) -> str:
             return "'Challenging data sets' sequence"
         if clouds_in(path):
             return "folder of clouds"
-    raise NoRecordingError(
-        f"{path}: no recording; expected a rosbag2 folder (metadata.yaml), a .bag, .mcap or .db3 "
-        "file, a KITTI folder (velodyne/), a folder or zip archive with Hokuyo_<i>.csv, or a "
-        "folder of .ply, .pcd, .bin, .npy or .csv clouds"
-    )
+    return None

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cello3d_ros.atomic import new_folder
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.recordings import ply
 from cello3d_ros.recordings.folder import ODOMETRY, TIMES, TRUTH
 from cello3d_ros.recordings.poses import kitti_line, seconds_text, tum_line
 from cello3d_ros.recordings.recording import Scan
-from cello3d_ros.recordings.staging import new_folder
 
 
 def write_kitti(path: Path, scans: Iterable[Scan]) -> int:

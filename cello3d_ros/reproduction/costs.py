@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from cello3d_ros.atomic import new_file
 
 
 class Costs:
@@ -43,6 +44,5 @@ class Costs:
         finally:
             spent = self._seconds()
             spent[step] = round(spent.get(step, 0.0) + time.process_time() - start, 2)
-            partial = self._path.with_name(f".{self._path.name}.{os.getpid()}.tmp")
-            partial.write_text(json.dumps(spent, indent=1) + "\n", encoding="utf-8")
-            os.replace(partial, self._path)
+            with new_file(self._path) as partial:
+                partial.write_text(json.dumps(spent, indent=1) + "\n", encoding="utf-8")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cello3d_ros.errors import Cello3dError
+from cello3d_ros.atomic import new_file
 from cello3d_ros.geometry.se3 import Array
 
 _HEAD = """# Results
@@ -95,16 +94,10 @@ def markdown_table(rows: Iterable[Sequence[str]]) -> str:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write a file in one piece, making its folder.  Raises Cello3dError."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    """Write a file in one piece, making its folder.  Raises WriteError."""
+    with new_file(path) as partial:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial.write_bytes(content)
-        os.replace(partial, path)
-    except OSError as error:
-        raise Cello3dError(f"cannot write {path}: {error.strerror or error}") from None
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _duration(seconds: float) -> str:

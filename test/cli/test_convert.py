@@ -16,7 +16,7 @@ from cello3d_ros.cli.convert import FORMATS
 from cello3d_ros.cli.main import main
 from cello3d_ros.geometry import se3
 from cello3d_ros.recordings import Scan, open_recording
-from cello3d_ros.recordings.bag import write_bag
+from cello3d_ros.recordings.bag_writer import write_bag
 
 START = 1_700_000_000_123_456_789
 LOSSLESS = [name for name in FORMATS if name != "kitti"]

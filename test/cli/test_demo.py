@@ -13,7 +13,7 @@ from consumer_rules import of_pose, of_twist
 from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.geometry.se3 import exp, inverse, transform
 from cello3d_ros.recordings import Scan
-from cello3d_ros.recordings.bag import write_bag
+from cello3d_ros.recordings.bag_writer import write_bag
 from cello3d_ros.tracking.warmup import room
 
 ROOM_SIGMAS = [3e-3] * 3 + [1e-3] * 3

@@ -91,7 +91,7 @@ def test_a_damaged_model_is_one_sentence(tmp_path: Path) -> None:
 
 def a_bag(folder: Path) -> Path:
     from cello3d_ros.recordings import Scan
-    from cello3d_ros.recordings.bag import write_bag
+    from cello3d_ros.recordings.bag_writer import write_bag
 
     scans = [
         Scan(

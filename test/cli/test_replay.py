@@ -14,7 +14,7 @@ from cello3d_ros.cli.main import main
 from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.geometry.se3 import exp, inverse, transform
 from cello3d_ros.recordings import Scan
-from cello3d_ros.recordings.bag import write_bag
+from cello3d_ros.recordings.bag_writer import write_bag
 from cello3d_ros.recordings.poses import read_tum
 from cello3d_ros.tracking.warmup import room
 

@@ -11,7 +11,7 @@ from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.recordings import Scan, open_recording
-from cello3d_ros.recordings.bag import write_bag
+from cello3d_ros.recordings.bag_writer import write_bag
 from cello3d_ros.recordings.deskew import deskew, deskewed
 
 STAMP = 1_700_000_000_123_456_789

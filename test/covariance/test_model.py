@@ -30,7 +30,7 @@ from cello3d_ros.covariance.model import (
     shipped_model_path,
     weigh,
 )
-from cello3d_ros.errors import ModelError
+from cello3d_ros.errors import ModelError, WriteError
 from cello3d_ros.geometry import gaussian
 from cello3d_ros.geometry.gaussian import is_positive_definite
 from cello3d_ros.geometry.se3 import Array, adjoint, exp
@@ -404,7 +404,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(np.lib.format, "write_array", full)
-    with pytest.raises(ModelError, match=r"cannot write .*No space left"):
+    with pytest.raises(WriteError, match=r"cannot write .*No space left"):
         save_model(a_model(), saved)
     assert saved.read_bytes() == before
     assert list(saved.parent.iterdir()) == [saved]
@@ -419,7 +419,7 @@ def test_a_reader_of_the_old_file_is_not_disturbed(saved: Path) -> None:
 
 
 def test_a_model_goes_nowhere_where_there_is_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="cannot write"):
+    with pytest.raises(WriteError, match="cannot write"):
         save_model(a_model(), tmp_path / "missing" / "m.npz")
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from cello3d_ros.config import IcpConfig, Pipeline, SamplingConfig
 from cello3d_ros.covariance.features import FEATURES
-from cello3d_ros.errors import DatasetError
+from cello3d_ros.errors import DatasetError, WriteError
 from cello3d_ros.learning.dataset import Dataset, PairRecord, open_dataset
 
 
@@ -214,7 +214,7 @@ def test_a_failing_disk_is_one_sentence_and_keeps_the_old_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(DatasetError, match=r"cannot write .*hall_0_1.npz: No space left"):
+    with pytest.raises(WriteError, match=r"cannot write .*hall_0_1.npz: No space left"):
         dataset.write(accepted(seed=2))
     assert_same(dataset.read("hall", 0, 1), accepted(seed=1))
     assert [path.name for path in (dataset.path / "pairs").iterdir()] == ["hall_0_1.npz"]

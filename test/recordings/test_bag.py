@@ -10,10 +10,11 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from cello3d_ros.errors import RecordingError
+from cello3d_ros.errors import RecordingError, WriteError
 from cello3d_ros.geometry import se3
 from cello3d_ros.recordings import Scan, open_recording
-from cello3d_ros.recordings.bag import BagRecording, write_bag
+from cello3d_ros.recordings.bag import BagRecording
+from cello3d_ros.recordings.bag_writer import write_bag
 
 CLOUD, ODOMETRY = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry"
 POSE, TRANSFORM = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped"
@@ -395,7 +396,7 @@ def test_a_bag_with_fewer_poses_than_it_declares_is_an_error(tmp_path: Path) -> 
 
 def test_an_existing_target_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "one").mkdir()
-    with pytest.raises(RecordingError, match="one exists already"):
+    with pytest.raises(WriteError, match="one exists already"):
         write_bag(tmp_path / "one", make_scans(2))
     assert list(tmp_path.iterdir()) == [tmp_path / "one"]
 
@@ -416,7 +417,7 @@ def test_a_failure_while_writing_leaves_nothing_behind(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(RecordingError, match="cannot write"):
+    with pytest.raises(WriteError, match="cannot write"):
         write_bag(tmp_path / "file" / "one", make_scans(2))
 
 

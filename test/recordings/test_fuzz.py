@@ -19,8 +19,8 @@ from rosbags.typesys import Stores, get_typestore
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.recordings import Scan, open_recording
-from cello3d_ros.recordings.bag import write_bag
 from cello3d_ros.recordings.bag_messages import Messages
+from cello3d_ros.recordings.bag_writer import write_bag
 from cello3d_ros.recordings.files import read_columns
 from cello3d_ros.recordings.ply import write as write_ply
 from cello3d_ros.recordings.writers import write_folder, write_kitti

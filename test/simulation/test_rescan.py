@@ -11,7 +11,8 @@ import pytest
 from cello3d_ros.cli import simulate as verb
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.recordings import open_recording
-from cello3d_ros.recordings.bag import BagRecording, write_bag
+from cello3d_ros.recordings.bag import BagRecording
+from cello3d_ros.recordings.bag_writer import write_bag
 from cello3d_ros.simulation.rescan import rescannable
 from cello3d_ros.simulation.scanner import SCANNERS, Echoes, measure
 from cello3d_ros.simulation.simulation import Simulation

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cello3d_ros.cli import simulate as verb
-from cello3d_ros.errors import RecordingError
+from cello3d_ros.errors import RecordingError, WriteError
 from cello3d_ros.recordings import open_recording
 from cello3d_ros.simulation.scanner import SCANNERS
 from cello3d_ros.simulation.simulation import simulate
@@ -52,5 +52,5 @@ def test_values_out_of_range_are_errors(words: list[str], tmp_path: Path) -> Non
 
 
 def test_a_taken_name_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="exists already"):
+    with pytest.raises(WriteError, match="exists already"):
         verb.run(parsed("rooms", "--out", str(tmp_path)))
