@@ -102,22 +102,22 @@ class GridConfig(Section):
 class SamplingConfig(Section):
     """Brute-force sampling of ICP on one pair (Sec. IV-D, V-A)."""
 
-    n_samples: int = _setting(5000, "registrations of each pair", 2)
+    n_samples: int = _setting(5000, "registrations of each pair", 50)
     variance: float = _setting(0.05, "a of the starts T_mean exp(xi), xi ~ N(0, a I)", 0.0, 10.0)
     max_gap: int = _setting(4, "largest j - i of a pair", 1)
     seed: int = _setting(0, "seed of every random draw", 0)
     max_offset_m: float = _setting(1.0, "a mean farther from the truth rejects the pair", 0.0)
     max_offset_rad: float = _setting(1.0, "a mean farther from the truth rejects the pair", 0.0)
-    cluster_scale_m: float = _setting(0.1, "translation that counts as one radius of DBSCAN", 1e-6)
-    cluster_scale_rad: float = _setting(0.05, "rotation that counts as one radius", 1e-6)
+    cluster_scale_m: float = _setting(0.1, "translation that a cluster spans at least", 1e-6)
+    cluster_scale_rad: float = _setting(0.05, "rotation that a cluster spans at least", 1e-6)
     n_rotations: int = _setting(4, "turns about z of each example, 1 is none", 1, 64)
     cluster_min_share: float = _setting(
-        0.002, "share of the samples within one radius that makes a core point", 0.0, 1.0
+        0.05, "share of the samples below which a cluster is passed over", 0.0, 1.0
     )
     precision: float = _setting(
         0.0, "relative standard error of the eigenvalues that ends a pair; 0 takes all", 0.0, 1.0
     )
-    min_samples: int = _setting(200, "fewest registrations before precision ends a pair", 2)
+    min_samples: int = _setting(200, "fewest registrations before precision ends a pair", 50)
     noise_m: float = _setting(
         0.0, "standard deviation of range noise added at each registration", 0.0, 10.0
     )
@@ -400,5 +400,6 @@ def _checked_scalar(setting: dataclasses.Field[Any], value: Any, default: Any, n
         raise ConfigError(f"{name} must be one of {', '.join(choices)}: {value!r}")
     low, high = setting.metadata["low"], setting.metadata["high"]
     if wanted in (int, float) and not low <= value <= high:
-        raise ConfigError(f"{name} must be in [{low:g}, {high:g}]: {value!r}")
+        allowed = f"at least {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
+        raise ConfigError(f"{name} must be {allowed}: {value!r}")
     return value

@@ -1,20 +1,15 @@
-"""Which sampled registrations converged: the cluster nearest to ground truth (Sec. IV-D).
-
-Source: DBSCAN as in Schubert et al. 2017, of which only one cluster is grown, so that memory
-stays linear in the samples however tight they are.
-"""
+"""Which sampled registrations converged: the cluster nearest to ground truth (Sec. IV-D)."""
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_FEWEST_IN_CORE = 2  # a sample alone is no cluster
+_FEWEST = 2  # a sample alone is no cluster
+_CHI2 = 22.458  # quantile .999 of chi-square with 6 degrees of freedom
+_MOST_STEPS = 100  # of a growing cluster; it takes about ten
 _FAR = 3.0  # clustering scales from the truth beyond which a registration is in another minimum
 
 
@@ -25,22 +20,47 @@ def nearest_cluster(
 
     xi: (n, 6) errors (u, omega) about ground truth.  Returns (n,), all False without a cluster.
 
-    The distance is that of ``(u / scale_m, omega / scale_rad)``, the radius of DBSCAN is 1, and a
-    core sample has at least ``max(2, ceil(min_share n))`` samples within it, itself included.
-    The cluster nearest to ground truth is the one with the core sample nearest to zero.  Its mean
-    would mislead: the ring of upside-down registrations of the paper's cylinder surrounds ground
-    truth, so that its mean lies there too, while none of its members does.  A border sample that
-    two clusters share is counted in.
+    With errors measured in scales, ``x = (u / scale_m, omega / scale_rad)``, a cluster with mean m
+    and covariance C holds the samples of the ellipsoid
+
+        (x - m)^T (chi2 C + I)^-1 (x - m) <= 1,
+
+    chi2 the quantile .999 with 6 degrees of freedom.  It is one scale wide where the samples are
+    tight and follows them where an axis is free.  It grows from the samples within one scale of
+    the one nearest to the truth until nothing changes.  One with less than ``min_share`` of all
+    samples is passed over, and the next sample starts another.
+
+    Nothing here depends on n: more samples give the same cluster, known better.  Nearness is that
+    of a sample, not of the mean: the ring of upside-down registrations of the paper's cylinder
+    surrounds ground truth, and so its mean lies there, while none of its members does.
     """
-    if len(xi) == 0:
-        return np.zeros(0, dtype=np.bool_)
-    scaled = np.ascontiguousarray(xi / np.repeat([scale_m, scale_rad], 3))
-    least = max(_FEWEST_IN_CORE, math.ceil(min_share * len(xi)))
-    core = _core(scaled, least)
-    if not core.any():
-        return np.zeros(len(xi), dtype=np.bool_)
-    norms2 = np.where(core, np.einsum("ni,ni->n", scaled, scaled), np.inf)
-    return np.asarray(_grown(scaled, core, int(np.argmin(norms2))))
+    x = xi / np.repeat([scale_m, scale_rad], 3)
+    least = max(_FEWEST, min_share * len(x))
+    tried = np.zeros(len(x), dtype=np.bool_)
+    for start in np.argsort(np.einsum("ni,ni->n", x, x), kind="stable"):
+        if tried[start]:
+            continue
+        kept = _grown(x, x[start])
+        if kept.sum() >= least:
+            return kept
+        tried |= kept
+        tried[start] = True
+    return np.zeros(len(x), dtype=np.bool_)
+
+
+def _grown(x: Array, start: Array) -> NDArray[np.bool_]:
+    """Return the cluster (n,) of x (n, 6) that grows from around a sample."""
+    d = x - start
+    kept = np.asarray(np.einsum("ni,ni->n", d, d) <= 1.0)
+    for _ in range(_MOST_STEPS):
+        d = x - x[kept].mean(axis=0)
+        C = np.einsum("ni,nj->ij", d[kept], d[kept]) / kept.sum()
+        information = np.linalg.inv(_CHI2 * C + np.eye(6))
+        inside = np.asarray(np.einsum("ni,ij,nj->n", d, information, d) <= 1.0)
+        if np.array_equal(inside, kept):
+            break
+        kept = inside
+    return kept
 
 
 def offset(xi: Array) -> tuple[float, float]:
@@ -62,62 +82,3 @@ def far_from_truth(xi: Array, scale_m: float, scale_rad: float) -> NDArray[np.bo
         (np.linalg.norm(xi[..., :3], axis=-1) > _FAR * scale_m)
         | (np.linalg.norm(xi[..., 3:], axis=-1) > _FAR * scale_rad)
     )
-
-
-@njit(cache=True, nogil=True)
-def _core(x: Array, least: int) -> NDArray[np.bool_]:
-    """Return which of x (n, d) have ``least`` of x within distance 1, themselves included."""
-    n = len(x)
-    core = np.zeros(n, np.bool_)
-    for i in range(n):
-        n_near = 0
-        for j in range(n):
-            if _near(x, i, j):
-                n_near += 1
-                if n_near == least:
-                    core[i] = True
-                    break
-    return core
-
-
-@njit(cache=True, nogil=True)
-def _grown(x: Array, core: NDArray[np.bool_], start: int) -> NDArray[np.bool_]:
-    """Return what is reached from a core sample by steps of at most 1 from core samples.
-
-    What is not yet reached stands in a list that only shrinks: a tight cluster is done after one
-    pass, and the worst case is n passes over n samples.
-    """
-    n = len(x)
-    reached = np.zeros(n, np.bool_)
-    reached[start] = True
-    rest = np.arange(n)
-    rest[start] = n - 1
-    n_rest = n - 1
-    todo = np.empty(n, np.int64)
-    todo[0] = start
-    n_todo = 1
-    while n_todo > 0:
-        n_todo -= 1
-        i = todo[n_todo]
-        k = 0
-        while k < n_rest:
-            j = rest[k]
-            if _near(x, i, j):
-                reached[j] = True
-                if core[j]:
-                    todo[n_todo] = j
-                    n_todo += 1
-                n_rest -= 1
-                rest[k] = rest[n_rest]
-            else:
-                k += 1
-    return reached
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _near(x: Array, i: int, j: int) -> bool:
-    distance2 = 0.0
-    for u in range(x.shape[1]):
-        d = x[i, u] - x[j, u]
-        distance2 += d * d
-    return distance2 <= 1.0

@@ -70,7 +70,7 @@ def reproduce(what: str, out: Path, *words: object) -> int:
 def test_tables_on_the_papers_own_format(
     data: Path, out: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ("--data", data, "--samples", 30)
+    words = ("--data", data, "--samples", 50)
     assert reproduce("table1", out, *words) == 0
     found = json.loads((out / "table1-recorded.json").read_text())
     assert list(found["sequences"]) == ["gazebo_summer", "gazebo_winter"]
@@ -104,7 +104,7 @@ def test_tables_on_the_papers_own_format(
 
 
 def test_odometry_on_the_papers_own_format(data: Path, out: Path) -> None:
-    words = ("--data", data, "--samples", 30)
+    words = ("--data", data, "--samples", 50)
     assert reproduce("table2", out, *words, "--runs", 3) == 0
     found = json.loads((out / "table2-recorded.json").read_text())
     for by_model in found["sequences"].values():
@@ -166,10 +166,10 @@ def test_a_cache_of_other_settings_is_refused(
     data: Path, out: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ("--data", data, "--samples")
-    assert reproduce("table1", out, *words, 30) == 0
+    assert reproduce("table1", out, *words, 50) == 0
     capsys.readouterr()
-    assert reproduce("table1", out, *words, 31) == 1
-    assert "sampling.n_samples is 30, here 31" in capsys.readouterr().err
+    assert reproduce("table1", out, *words, 51) == 1
+    assert "sampling.n_samples is 50, here 51" in capsys.readouterr().err
 
 
 def test_sequences_are_trained_and_tested_apart() -> None:

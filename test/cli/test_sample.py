@@ -19,7 +19,7 @@ from cello3d_ros.geometry.se3 import exp, inverse, transform
 CONFIG = """
 cloud: {voxel_m: 0.1}
 icp: {n_reading_points: 400, n_reference_points: 1500}
-sampling: {n_samples: 20, variance: 0.01, max_gap: 2, n_rotations: 2}
+sampling: {n_samples: 50, variance: 0.01, max_gap: 2, n_rotations: 2}
 training: {max_iterations: 5, rank: 2}
 """
 
@@ -152,7 +152,7 @@ def files(folder):
 
 def test_killed_at_random_moments_the_dataset_is_that_of_an_undisturbed_run(tmp_path):
     """kill -9, five times: after some pairs were written, a random part of a pair later."""
-    (tmp_path / "config.yaml").write_text(CONFIG.replace("n_samples: 20", "n_samples: 200"))
+    (tmp_path / "config.yaml").write_text(CONFIG.replace("n_samples: 50", "n_samples: 200"))
     recordings = [write_kitti(tmp_path / "long", 0, n_scans=8)]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert started(tmp_path, recordings, whole).wait(120) == 0
@@ -199,7 +199,7 @@ def test_adaptive_sampling_says_so_in_the_manifest_and_resumes(tmp_path, recordi
     flags = ["--samples", "adaptive", "--precision", "0.5"]
     assert sample(tmp_path, recordings[:1], *flags) == 0
     settings = json.loads((tmp_path / "dataset" / "manifest.json").read_text())["configuration"]
-    assert (settings["sampling"]["precision"], settings["sampling"]["n_samples"]) == (0.5, 20)
+    assert (settings["sampling"]["precision"], settings["sampling"]["n_samples"]) == (0.5, 50)
     before = contents(tmp_path)
     assert sample(tmp_path, recordings[:1], *flags) == 0
     assert contents(tmp_path) == before
@@ -229,6 +229,13 @@ def test_samples_that_are_no_number_are_a_usage_error(tmp_path, recordings, caps
     with pytest.raises(SystemExit) as error:
         sample(tmp_path, recordings, "--samples", "many")
     assert error.value.code == 2
+
+
+def test_too_few_samples_are_refused_before_any_registration(tmp_path, recordings, capsys):
+    assert sample(tmp_path, recordings, "--samples", "10") == 1
+    error = capsys.readouterr().err
+    assert error == "cello3d: SamplingConfig.n_samples must be at least 50: 10\n"
+    assert not (tmp_path / "dataset").exists()
 
 
 def test_two_recordings_of_one_name_are_refused(tmp_path, recordings, capsys):
@@ -332,7 +339,7 @@ def test_the_bar_tells_registrations_a_second_and_the_time_left(tmp_path, record
     monkeypatch.setattr("sys.stderr", terminal)
     assert sample(tmp_path, recordings[:1]) == 0
     last = terminal.getvalue().rstrip().split("\r")[-1]
-    assert "100/100" in last
+    assert "250/250" in last
     assert "reg/s" in last
     assert "pair 5 of 5" in last
     assert "<" in last

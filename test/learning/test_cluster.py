@@ -199,7 +199,7 @@ def test_only_what_is_asked_for_is_sampled(recording, cluster, local):
 
 
 def test_adaptive_sampling_is_that_of_one_machine(recording, cluster):
-    sampling = dataclasses.replace(SAMPLING, precision=0.3, min_samples=20)
+    sampling = dataclasses.replace(SAMPLING, precision=0.3, min_samples=50)
     todo = [(0, 1), (1, 2)]
     wanted = by_key(sample_recording(open_recording(recording), todo, PIPELINE, sampling), 2)
     assert all(record.n_samples < 60 for record in wanted.values())

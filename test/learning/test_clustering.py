@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from cello3d_ros.learning.clustering import far_from_truth, nearest_cluster, off
 
 CONFIG = SamplingConfig()
 NOISE = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005])
+NARROW = 0.3 * NOISE
 
 
 def kept(xi: Array) -> np.ndarray:
@@ -131,38 +134,93 @@ def test_offset_is_the_mean_over_all_samples() -> None:
     assert offset(xi) == pytest.approx((5.0, 0.5))
 
 
-def dbscan(xi: Array, scale_m: float, scale_rad: float, min_share: float) -> np.ndarray:
-    """Return the same with scikit-learn's DBSCAN, which holds all pairs of neighbours."""
-    from sklearn.cluster import DBSCAN
-
-    scaled = xi / np.repeat([scale_m, scale_rad], 3)
-    least = max(2, int(np.ceil(min_share * len(xi))))
-    found = DBSCAN(eps=1.0, min_samples=least).fit(scaled)
-    core = found.core_sample_indices_
-    if len(core) == 0:
-        return np.zeros(len(xi), bool)
-    nearest = core[np.argmin(np.linalg.norm(scaled[core], axis=1))]
-    return found.labels_ == found.labels_[nearest]
+def mixture(rng: np.random.Generator, n: int) -> Array:
+    """95 % at 3 mm, 5 % uniform over 1 m to both sides."""
+    xi = rng.normal(size=(n, 6)) * NARROW
+    out = rng.uniform(size=n) < 0.05
+    xi[out, 0] = rng.uniform(-1.0, 1.0, out.sum())
+    return xi
 
 
-@pytest.mark.parametrize("share", [0.0, 0.004, 0.03])
-@pytest.mark.parametrize("spread", [0.02, 0.15, 0.4, 1.0])
-def test_the_cluster_is_that_of_scikit_learn(spread: float, share: float) -> None:
-    rng = np.random.default_rng(9)
-    centres = rng.normal(size=(6, 6)) * spread
-    xi = centres[rng.integers(6, size=900)] + rng.standard_t(3, (900, 6)) * NOISE
-    np.testing.assert_array_equal(
-        nearest_cluster(xi, 0.1, 0.05, share), dbscan(xi, 0.1, 0.05, share)
-    )
+def two_clusters(rng: np.random.Generator, n: int) -> Array:
+    xi = rng.normal(size=(n, 6)) * NARROW
+    xi[rng.uniform(size=n) < 0.5] += [0.3, 0.0, 0.0, 0.0, 0.0, 0.0]
+    return xi
+
+
+def ring_about_a_free_turn(rng: np.random.Generator, n: int) -> Array:
+    xi = rng.normal(size=(n, 6)) * NARROW
+    xi[:, 5] += rng.normal(size=n) * np.sqrt(CONFIG.variance)
+    ring, angle = rng.uniform(size=n) < 0.3, rng.uniform(0.0, 2.0 * np.pi, n)
+    xi[ring, 3:5] += np.pi * np.stack([np.cos(angle), np.sin(angle)], axis=1)[ring]
+    return xi
+
+
+def free_along_x(rng: np.random.Generator, n: int) -> Array:
+    xi = rng.normal(size=(n, 6)) * NARROW
+    xi[:, 0] += rng.normal(size=n) * np.sqrt(CONFIG.variance)
+    return xi
+
+
+def free_turn_of_a_radian(rng: np.random.Generator, n: int) -> Array:
+    xi = rng.normal(size=(n, 6)) * NARROW
+    xi[:, 5] += rng.normal(size=n) * 0.9
+    return xi
+
+
+def heavy_tails(rng: np.random.Generator, n: int) -> Array:
+    """Student's t with 3 degrees of freedom, scales of 1 cm and 5 mrad."""
+    return rng.normal(size=(n, 6)) * NOISE / np.sqrt(rng.chisquare(3, n) / 3)[:, None]
+
+
+def gaussian_of_nine_centimetres(rng: np.random.Generator, n: int) -> Array:
+    return rng.normal(size=(n, 6)) * np.repeat([0.09, 0.02], 3)
+
+
+@pytest.mark.parametrize(
+    "distribution",
+    [
+        mixture,
+        two_clusters,
+        ring_about_a_free_turn,
+        free_along_x,
+        free_turn_of_a_radian,
+        heavy_tails,
+        gaussian_of_nine_centimetres,
+    ],
+)
+def test_the_covariance_does_not_depend_on_the_number_of_samples(
+    distribution: Callable[[np.random.Generator, int], Array],
+) -> None:
+    """Its mean over many draws of n is that of 20 draws of 5000, to four standard errors."""
+
+    def drawn(n: int, repeats: int) -> tuple[Array, Array]:
+        diagonals = []
+        for k in range(repeats):
+            xi = distribution(np.random.default_rng([n, k]), n)
+            xi = xi[kept(xi)]
+            diagonals.append(np.diag(xi.T @ xi) / (len(xi) - 1))
+        return np.mean(diagonals, axis=0), np.std(diagonals, axis=0) / np.sqrt(repeats)
+
+    Y, error = drawn(5000, 20)
+    for n, repeats in ((100, 200), (200, 200), (500, 100), (1000, 50)):
+        Y_n, error_n = drawn(n, repeats)
+        assert (np.abs(Y_n - Y) < 4.0 * np.hypot(error, error_n)).all(), n
+        np.testing.assert_allclose(np.sqrt(Y_n), np.sqrt(Y), rtol=0.2, err_msg=str(n))
+
+
+def test_stragglers_do_not_widen_a_tight_cluster_beyond_one_scale() -> None:
+    xi = mixture(np.random.default_rng(9), 5000)
+    expected = np.sqrt((0.95 * NARROW[0] ** 2 + 0.005 * 0.1**2 / 3.0) / 0.955)
+    assert xi[kept(xi), 0].std() == pytest.approx(expected, rel=0.1)
 
 
 def test_memory_is_linear_in_samples_that_are_all_neighbours() -> None:
     import tracemalloc
 
-    nearest_cluster(noise(100), 0.1, 0.05, 0.002)  # compiles
     xi = noise(20_000) * 0.1
     tracemalloc.start()
-    assert nearest_cluster(xi, 0.1, 0.05, 0.002).all()
+    assert nearest_cluster(xi, 0.1, 0.05, 0.05).all()
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 10 * xi.nbytes

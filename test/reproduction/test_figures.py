@@ -65,7 +65,7 @@ def test_registrations_lock_on_to_the_next_pillars() -> None:
 def test_sampled_covariance_and_censi_grow_with_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("open3d")
     monkeypatch.setattr(noise, "SIGMAS_M", (0.005, 0.05))
-    result = noise.make(30, 2, 0)
+    result = noise.make(50, 2, 0)
     found = {(r["scene"], r["sigma_m"], r["block"]): r for r in result.data["rows"]}
     for scene in ("cube", "apartment"):
         low, high = found[scene, 0.005, "u_m2"], found[scene, 0.05, "u_m2"]
