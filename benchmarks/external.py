@@ -27,7 +27,7 @@ from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import mahalanobis
 from cello3d_ros.recordings import Recording, Scan, open_recording
-from cello3d_ros.recordings.odometry import with_odometry
+from cello3d_ros.recordings.odometry import SimulatedOdometry
 from cello3d_ros.tracking.guess import EXTERNAL, ODOMETRY, Place
 from cello3d_ros.tracking.tracker import Answer, Tracker
 
@@ -112,7 +112,7 @@ def main() -> None:
         for name, settings in (("external", {}), ("unseen", {"max_external_offset": 0.0}))
     } | {
         "icp": run(
-            ((s, Place(s.T_odom_sensor, guess=ODOMETRY)) for s in with_odometry(recording)),
+            ((s, Place(s.T_odom_sensor, guess=ODOMETRY)) for s in SimulatedOdometry(recording)),
             tracker(),
         ),
         "kiss_icp_ms": float(np.median([ms for *_, ms in theirs])),

@@ -39,7 +39,7 @@ import numpy as np
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry import se3
 from cello3d_ros.recordings import Scan, open_recording
-from cello3d_ros.recordings.odometry import with_odometry
+from cello3d_ros.recordings.odometry import SimulatedOdometry
 from cello3d_ros.ros.process import NodeProcess, environment
 
 DOMAIN_ID = 101 + os.getpid() % 100
@@ -78,7 +78,10 @@ def main() -> int:
 
 def recorded(arguments: argparse.Namespace, parameters: dict[str, Any]) -> dict[str, Any]:
     """Return the latencies on a recording, and KISS-ICP's."""
-    scans = to_and_fro(list(with_odometry(open_recording(arguments.recording))), arguments)
+    recording = open_recording(arguments.recording)
+    if not recording.has_odometry:
+        recording = SimulatedOdometry(recording)
+    scans = to_and_fro(list(recording), arguments)
     result = {
         "recording": arguments.recording.name,
         "n_points": int(np.median([len(scan.points) for scan in scans])),
@@ -94,6 +97,7 @@ class InMemory(list[Scan]):
     """Scans as a recording."""
 
     name = "in memory"
+    has_odometry = True
 
 
 def to_and_fro(scans: list[Scan], arguments: argparse.Namespace) -> InMemory:

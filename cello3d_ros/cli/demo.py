@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cello3d_ros.atomic import new_file, new_folder
+from cello3d_ros.cli.sources import add_source_arguments, open_source
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry.gaussian import mahalanobis, to_fixed_axes
 from cello3d_ros.geometry.se3 import Array, inverse, log
-from cello3d_ros.recordings import Recording, open_recording
+from cello3d_ros.recordings import Recording
 
 if TYPE_CHECKING:
     from cello3d_ros.ros.process import NodeProcess
@@ -26,6 +27,11 @@ _CHI2_6_95 = 12.591587  # 95 % of a chi-squared distribution of 6 degrees of fre
 _ROS_IS_MISSING = (
     "the demo needs ROS 2: source /opt/ros/jazzy/setup.bash, or "
     "pip install ros-jazzy-rclpy ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
+)
+
+_WITHOUT_ODOMETRY = (
+    "node.guess_without_odometry:=constant_velocity",
+    "node.odometry_timeout_s:=0.0",
 )
 
 
@@ -50,6 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME:=VALUE",
         help="parameter of the node; may be repeated",
     )
+    add_source_arguments(parser)
     parser.add_argument("--domain-id", type=int, help="ROS domain of the demo (one of its own)")
 
 
@@ -57,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Leave summary.json, trajectory.png and the node's messages; 1 if an answer is missing."""
     if arguments.rate is not None and not arguments.rate > 0:
         raise Cello3dError(f"--rate must be above 0: {arguments.rate}")
-    recording = open_recording(arguments.recording)
+    recording = open_source(arguments.recording, arguments)
     out: Path = arguments.out
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -130,11 +137,14 @@ def _errors(replay: Replay) -> tuple[Array, Array]:
 
 
 def _T_world_odom(replay: Replay) -> Array | None:
-    """Return the odometry's frame in that of ground truth, equal at the first scan."""
-    first_ns = next(iter(replay.T_odom), None)
+    """Return the odometry's frame in that of ground truth, equal at the first scan.
+
+    Without odometry the node starts at the identity.
+    """
+    first_ns = next(iter(replay.T_odom or replay.T_world), None)
     if first_ns is None or (T_world := replay.T_world.get(first_ns)) is None:
         return None
-    return T_world @ inverse(replay.T_odom[first_ns])
+    return T_world @ inverse(replay.T_odom.get(first_ns, np.eye(4)))
 
 
 def _final_error_m(replay: Replay) -> float | None:
@@ -160,12 +170,14 @@ def draw(replay: Replay, name: str, path: Path) -> None:
     truth = np.array([T[:2, 3] for T in replay.T_world.values() if T is not None])
     odometry = np.array([(M @ T)[:2, 3] for T in replay.T_odom.values()])
     poses = [pose for _, pose in sorted(replay.poses.items())]
-    icp = np.array([odometry[0], *((M @ pose.T)[:2, 3] for pose in poses)])
+    start = odometry[0] if len(odometry) else M[:2, 3]
+    icp = np.array([start, *((M @ pose.T)[:2, 3] for pose in poses)])
     figure = Figure(figsize=(8, 8), dpi=120, layout="constrained")
     axes = figure.add_subplot()
     if len(truth):
         axes.plot(*truth.T, color="black", linewidth=4, alpha=0.3, label="ground truth")
-    axes.plot(*odometry.T, color="tab:orange", linestyle="--", label="odometry")
+    if len(odometry):
+        axes.plot(*odometry.T, color="tab:orange", linestyle="--", label="odometry")
     axes.plot(*icp.T, color="tab:blue", marker=".", label="ICP (~/pose of the node)")
     B = M[:3, :3]
     _draw_ellipses(axes, icp[1:], [(B @ pose.C[:3, :3] @ B.T)[:2, :2] for pose in poses])
@@ -237,7 +249,8 @@ def _replay(
         from cello3d_ros.ros.replay import Player
     except ImportError as error:
         raise Cello3dError(f"{_ROS_IS_MISSING} ({error})") from None
-    given = [word for text in arguments.param for word in ("-p", text)]
+    parameters = [*(() if recording.has_odometry else _WITHOUT_ODOMETRY), *arguments.param]
+    given = [word for text in parameters for word in ("-p", text)]
     if arguments.model:
         given += ["-p", f"node.model:={find_model(arguments.model).resolve()}"]
     with NodeProcess(arguments.out / "node.log", domain_id, ros_arguments=given) as node:

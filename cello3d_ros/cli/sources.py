@@ -14,10 +14,17 @@ if TYPE_CHECKING:
     from cello3d_ros.recordings import Recording
 
 
+SIMULATED = "simulated"
+
+
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options that say how a recording is read."""
     parser.add_argument("--points", metavar="TOPIC", help="clouds of a bag")
-    parser.add_argument("--odometry", metavar="TOPIC", help="odometry of a bag, '' for none")
+    parser.add_argument(
+        "--odometry",
+        metavar="TOPIC",
+        help="odometry of a bag, '' for none; 'simulated': ground truth made to drift",
+    )
     parser.add_argument("--ground-truth", metavar="TOPIC", help="ground truth, '' for none")
     parser.add_argument(
         "--ground-truth-frames", nargs=2, metavar=("WORLD", "FRAME"), help="ground truth from TF"
@@ -40,6 +47,7 @@ def open_source(path: Path, arguments: argparse.Namespace) -> Recording:
 
     from cello3d_ros.geometry import se3
     from cello3d_ros.recordings import open_recording
+    from cello3d_ros.recordings.odometry import SimulatedOdometry
 
     T_base_sensor = None
     if (given := arguments.extrinsic) is not None:
@@ -47,15 +55,17 @@ def open_source(path: Path, arguments: argparse.Namespace) -> Recording:
             raise RecordingError("--extrinsic needs x y z and a unit quaternion qx qy qz qw")
         T_base_sensor = se3.pose(given[:3], given[3:])
     frames = arguments.ground_truth_frames
-    return open_recording(
+    is_simulated = arguments.odometry == SIMULATED
+    recording = open_recording(
         path,
         arguments.points,
-        arguments.odometry,
+        None if is_simulated else arguments.odometry,
         arguments.ground_truth,
         ground_truth_frames=None if frames is None else (frames[0], frames[1]),
         T_base_sensor=T_base_sensor,
         poses=arguments.poses,
     )
+    return SimulatedOdometry(recording) if is_simulated else recording
 
 
 def with_progress(scans: Iterable[Any], total: int, name: str) -> Any:

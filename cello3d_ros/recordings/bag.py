@@ -105,6 +105,11 @@ class BagRecording:
         """0: quaternions are normalised, which is no projection."""
         return 0
 
+    @property
+    def has_odometry(self) -> bool:
+        """Whether there is a topic of odometry."""
+        return self.topics.odometry is not None
+
     def odometry(self) -> Iterator[tuple[int, Array]]:
         """Yield every odometry message as its stamp and T_odom_base (4, 4), in order of time."""
         if self.topics.odometry is not None:

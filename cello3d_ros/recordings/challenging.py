@@ -66,6 +66,8 @@ class ChallengingRecording:
     are found by poseId, by row where ids and numbers of files differ.
     """
 
+    has_odometry = False
+
     def __init__(self, path: Path | str) -> None:
         """Read the poses.  Raises RecordingError."""
         self.path = Path(path)

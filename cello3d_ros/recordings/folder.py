@@ -67,6 +67,11 @@ class FolderRecording:
         """Name of the folder."""
         return self.folder.resolve().name
 
+    @property
+    def has_odometry(self) -> bool:
+        """Whether there is an ``odometry.tum``."""
+        return self._odometry is not None
+
     def __len__(self) -> int:
         return len(self._files)
 

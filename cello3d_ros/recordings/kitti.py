@@ -28,6 +28,8 @@ class KittiRecording:
     ``T_world_sensor = Tr^-1 T_cam Tr``.  Without times.txt, scans are 0.1 s apart.
     """
 
+    has_odometry = False
+
     def __init__(self, folder: Path | str) -> None:
         """Read everything but the clouds.  Raises RecordingError naming file and row."""
         self.folder = Path(folder)

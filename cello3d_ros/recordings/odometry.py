@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings.recording import Recording, Scan
 
@@ -44,23 +45,47 @@ def drift_odometry(
     return np.stack(out)
 
 
-def with_odometry(recording: Recording, seed: int = 0) -> Iterator[Scan]:
-    """Yield the scans; where a recording has no odometry, its ground truth made to drift.
+class SimulatedOdometry:
+    """A recording whose odometry is its ground truth made to drift; its own is not looked at.
 
-    Raises RecordingError where there is neither.
+    A scan without ground truth has no odometry.
     """
-    first = next(iter(recording), None)
-    if first is None:
-        raise RecordingError(f"{recording.name} holds no scan")
-    if first.T_odom_sensor is not None:
-        for scan in recording:
-            if scan.T_odom_sensor is not None:
-                yield scan
-        return
-    truth = [scan.T_world_sensor for scan in recording]
-    known = [T for T in truth if T is not None]
-    if len(known) < len(truth):
-        raise RecordingError(f"{recording.name} has neither odometry nor ground truth throughout")
-    drifted = drift_odometry(np.stack(known), np.random.default_rng(seed))
-    for scan, T in zip(recording, drifted, strict=True):
-        yield replace(scan, T_odom_sensor=T)
+
+    has_odometry = True
+
+    def __init__(self, recording: Recording, seed: int = 0) -> None:
+        """seed: of the drift.  Nothing is read yet."""
+        self.recording, self._seed = recording, seed
+
+    @property
+    def name(self) -> str:
+        """Name of the recording."""
+        return self.recording.name
+
+    @property
+    def n_projected(self) -> int:
+        """As of the recording."""
+        return self.recording.n_projected
+
+    def __len__(self) -> int:
+        return len(self.recording)
+
+    def __iter__(self) -> Iterator[Scan]:
+        drifted = iter(self._drifted()[1])
+        for scan in self.recording:
+            is_known = scan.T_world_sensor is not None
+            yield replace(scan, T_odom_sensor=next(drifted) if is_known else None)
+
+    def track(self) -> PoseTrack:
+        """Return the odometry at the stamps."""
+        return PoseTrack.of_poses(*self._drifted())
+
+    def _drifted(self) -> tuple[list[int], Array]:
+        stamps, truth = [], []
+        for scan in self.recording:
+            if scan.T_world_sensor is not None:
+                stamps.append(scan.stamp_ns)
+                truth.append(scan.T_world_sensor)
+        if not truth:
+            raise RecordingError(f"{self.name} has no ground truth to simulate odometry from")
+        return stamps, drift_odometry(np.stack(truth), np.random.default_rng(self._seed))

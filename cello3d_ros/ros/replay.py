@@ -20,7 +20,6 @@ from visualization_msgs.msg import MarkerArray
 
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry.se3 import Array, interpolate
-from cello3d_ros.recordings.odometry import with_odometry
 from cello3d_ros.recordings.recording import Recording, Scan
 from cello3d_ros.ros import messages
 from cello3d_ros.ros.diagnostics import ANSWERED, WAITING
@@ -33,6 +32,7 @@ _TYPES: dict[str, Any] = {
     "diagnostics": DiagnosticArray,
 }
 _START_S = 180.0  # left to a node to start: the first time it compiles its kernels
+_MATCHING_S = 1.0  # in which the node, too, learns of the publisher of clouds
 _N_ODOMETRY = 4  # odometry messages for each cloud
 
 
@@ -120,16 +120,19 @@ class Player:
         self._node.destroy_node()
         self._context.try_shutdown()
 
-    def connect(self, stamp_ns: int, T: Array, timeout_s: float) -> None:
+    def connect(self, stamp_ns: int, T: Array | None, timeout_s: float) -> None:
         """Wait until the target hears and is heard, by odometry before ``stamp_ns``.
 
-        Raises ReplayError after ``timeout_s``.
+        T: the pose of that odometry; without one only the publishers and subscriptions are
+        matched, and a second more.  Raises ReplayError after ``timeout_s``.
         """
         before_ns = stamp_ns - 900_000_000
 
         def connected() -> bool:
             nonlocal before_ns
             if self.odometry.get_subscription_count() and self.clouds.get_subscription_count():
+                if T is None:
+                    return all(s.get_publisher_count() for s in self._subscriptions)
                 self.publish_odometry(before_ns, T)
                 before_ns = min(before_ns + 5_000_000, stamp_ns - 1)
             heard = int(self.replay.last_status.get("odometry_received", 0)) > 0
@@ -137,6 +140,8 @@ class Player:
 
         if not self.spin_until(connected, timeout_s):
             raise ReplayError(f"no covariance_node was found in {timeout_s:g} s")
+        if T is None:
+            self.spin_for(_MATCHING_S)
 
     def publish_odometry(self, stamp_ns: int, T: Array) -> None:
         """Publish one pose of ``lidar`` in ``odom``."""
@@ -211,16 +216,16 @@ def play(
     Each cloud waits for the answer to the one before, or a failure that diagnostics name, for at
     most ``timeout_s``; with ``rate_hz`` clouds come at that rate whatever the node does, and only
     the last is waited for.  progress: called with the number of scans played.
-    Raises ReplayError when the node is not found, RecordingError when there is no odometry.
+    Odometry is played where the scans have it.  Raises ReplayError when the node is not found.
     """
     replay, before, next_s = player.replay, None, 0.0
-    for n, scan in enumerate(with_odometry(recording)):
-        assert scan.T_odom_sensor is not None
+    for n, scan in enumerate(recording):
         if before is None:
             player.connect(scan.stamp_ns, scan.T_odom_sensor, _START_S)
             next_s = time.monotonic()
         replay.T_world[scan.stamp_ns] = scan.T_world_sensor
-        replay.T_odom[scan.stamp_ns] = scan.T_odom_sensor
+        if scan.T_odom_sensor is not None:
+            replay.T_odom[scan.stamp_ns] = scan.T_odom_sensor
         if rate_hz is not None:
             player.spin_for(next_s - time.monotonic())
             next_s += 1.0 / rate_hz
@@ -238,7 +243,8 @@ def play(
 
 def _odometry_up_to(before: Scan | None, scan: Scan) -> Iterator[tuple[int, Array]]:
     """Yield stamps and poses after the scan before, up to and at this one."""
-    assert scan.T_odom_sensor is not None
+    if scan.T_odom_sensor is None:
+        return
     if before is not None and before.T_odom_sensor is not None:
         span_ns = scan.stamp_ns - before.stamp_ns
         for k in range(1, _N_ODOMETRY):

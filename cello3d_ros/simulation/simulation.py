@@ -59,6 +59,11 @@ class Simulation:
         """0: poses are exact."""
         return 0
 
+    @property
+    def has_odometry(self) -> bool:
+        """True: it drifts from the exact poses."""
+        return True
+
     def __len__(self) -> int:
         return self.n_scans
 

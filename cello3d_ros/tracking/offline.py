@@ -10,13 +10,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from cello3d_ros.config import NodeConfig
-from cello3d_ros.errors import Cello3dError
+from cello3d_ros.errors import Cello3dError, RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.pose_track import PoseError, PoseTrack
 from cello3d_ros.recordings.bag import BagRecording
-from cello3d_ros.recordings.odometry import with_odometry
 from cello3d_ros.recordings.recording import Recording, Scan
-from cello3d_ros.tracking.guess import EXTERNAL, ODOMETRY, Locator, Place
+from cello3d_ros.tracking.guess import CONSTANT_VELOCITY, EXTERNAL, ODOMETRY, Locator, Place
 from cello3d_ros.tracking.odometry import PoseSource
 from cello3d_ros.tracking.tracker import Answer, Tracker
 
@@ -48,20 +47,34 @@ def _step(scan: Scan, place: Place, tracker: Tracker) -> Step:
     return Step(scan, answer, "" if answer is not None else "reference")
 
 
-def _places(recording: Recording, config: NodeConfig) -> Iterator[tuple[Scan, Place | PoseError]]:
-    """Yield each scan with its place: by a bag's messages as they are, else made of the poses.
+def _place_of(scan: Scan, has_odometry: bool, config: NodeConfig) -> Place | PoseError:
+    """Return the place of a scan by its own pose, or why it has none."""
+    guess = EXTERNAL if config.registration == "external" else ODOMETRY
+    if scan.T_odom_sensor is None:
+        if has_odometry and config.guess_without_odometry != CONSTANT_VELOCITY:
+            return PoseError("the recording has none there")
+        guess = CONSTANT_VELOCITY
+    X = se3.pose(config.T_base_sensor[:3], config.T_base_sensor[3:])
+    return Place(scan.T_odom_sensor, X, guess=guess)
 
-    They are taken as registrations when ``registration`` is external.
+
+def _places(recording: Recording, config: NodeConfig) -> Iterator[tuple[Scan, Place | PoseError]]:
+    """Yield each scan with its place: by a bag's messages as they are, else by the scans' poses.
+
+    They are taken as registrations when ``registration`` is external.  A recording without
+    odometry is worked on at constant velocity.
     """
+    if config.registration == "external" and not recording.has_odometry:
+        raise RecordingError(
+            f"{recording.name} has no odometry, and node.registration external needs poses"
+        )
     source = PoseSource(
         PoseTrack(config.odometry_gap_s, config.odometry_buffer_s, what="odometry")
     )
     locator = Locator(config, source)
-    if not isinstance(recording, BagRecording) or recording.topics.odometry is None:
-        guess = EXTERNAL if config.registration == "external" else ODOMETRY
-        X = se3.pose(config.T_base_sensor[:3], config.T_base_sensor[3:])
-        for scan in with_odometry(recording):
-            yield scan, Place(scan.T_odom_sensor, X, guess=guess)
+    if not isinstance(recording, BagRecording) or not recording.has_odometry:
+        for scan in recording:
+            yield scan, _place_of(scan, recording.has_odometry, config)
         return
     messages = recording.odometry()
     for scan in recording:

@@ -135,6 +135,28 @@ def test_a_missing_answer_is_one_sentence_and_status_1(tmp_path, model) -> None:
     assert summary["median_translation_error_m"] is None
 
 
+def test_a_recording_without_any_poses_is_answered_at_constant_velocity(tmp_path, model) -> None:
+    pytest.importorskip("rclpy")
+    rng = np.random.default_rng(2)
+    poses = [exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.1]) * i) for i in range(4)]
+    write_bag(
+        tmp_path / "bare",
+        (
+            Scan(stamp_ns=10**18 + i * 10**8, points=transform(inverse(T), room(rng)))
+            for i, T in enumerate(poses)
+        ),
+    )
+    words = ("demo", "--recording", tmp_path / "bare", "--model", model)
+    done = cello3d(*words, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "3 of 3" in done.stdout
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["final_translation_error_m"] is None
+    done = cello3d(*words, "--out", tmp_path / "simulated", "--odometry", "simulated")
+    assert done.returncode == 1
+    assert "bare has no ground truth to simulate odometry from" in done.stderr
+
+
 def test_without_ros_it_says_what_to_install(tmp_path, bag) -> None:
     done = cello3d(
         *("demo", "--recording", bag, "--out", tmp_path),

@@ -30,7 +30,14 @@ def model(tmp_path_factory) -> Path:
     return path
 
 
-def walk(path: Path, holes: tuple[int, ...] = (), odometry: bool = True) -> Path:
+def walk(
+    path: Path,
+    holes: tuple[int, ...] = (),
+    odometry: bool = True,
+    truth: bool = True,
+    late: int = 0,
+) -> Path:
+    """Write a bag; holes: clouds that are empty; late: clouds before the first odometry."""
     rng = np.random.default_rng(2)
     poses = [exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.1]) * i) for i in range(N)]
     drift = np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.002])
@@ -38,8 +45,8 @@ def walk(path: Path, holes: tuple[int, ...] = (), odometry: bool = True) -> Path
         Scan(
             stamp_ns=10**18 + i * 500_000_000,
             points=np.empty((0, 3)) if i in holes else transform(inverse(T), room(rng)),
-            T_world_sensor=T,
-            T_odom_sensor=T @ exp(drift * i) if odometry else None,
+            T_world_sensor=T if truth else None,
+            T_odom_sensor=T @ exp(drift * i) if odometry and i >= late else None,
         )
         for i, T in enumerate(poses)
     ]
@@ -111,11 +118,57 @@ def test_failures_are_counted_and_named(tmp_path: Path, model: Path, capsys) -> 
     assert lines[2]["reason"] == "too_few_points"
 
 
-def test_without_odometry_ground_truth_is_made_to_drift(tmp_path: Path, model: Path) -> None:
+def lines_of(out: Path) -> list[dict]:
+    return [json.loads(line) for line in (out / "covariances.jsonl").read_text().splitlines()]
+
+
+def test_without_odometry_the_guess_is_constant_velocity_and_ground_truth_is_not_read(
+    tmp_path: Path, model: Path
+) -> None:
+    for name in ("walk", "bare"):
+        bag = walk(tmp_path / name, odometry=False, truth=name == "walk")
+        out = tmp_path / f"{name}-out"
+        assert main(["replay", str(bag), "--out", str(out), "--model", str(model)]) == 0
+    with_truth, without = lines_of(tmp_path / "walk-out"), lines_of(tmp_path / "bare-out")
+    assert with_truth == without
+    assert len(with_truth) == N
+    step = exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.1]))
+    for line in without[1:]:
+        assert np.abs(np.reshape(line["T_ref_read"], (4, 4)) - step).max() < 0.02
+
+
+def test_odometry_is_simulated_where_that_is_asked_for_by_name(tmp_path, model) -> None:
     bag = walk(tmp_path / "walk", odometry=False)
+    words = ["replay", str(bag), "--model", str(model), "--odometry", "simulated"]
+    assert main([*words, "--out", str(tmp_path / "a")]) == 0
+    assert main([*words, "--out", str(tmp_path / "b")]) == 0
+    assert lines_of(tmp_path / "a") == lines_of(tmp_path / "b")
+    assert main([*words[:4], "--out", str(tmp_path / "c")]) == 0
+    assert lines_of(tmp_path / "a") != lines_of(tmp_path / "c")
+
+
+def test_external_poses_that_nobody_gave_are_not_made(tmp_path, model, capsys) -> None:
+    bag = walk(tmp_path / "walk", odometry=False)
+    (tmp_path / "c.yaml").write_text("node: {registration: external}\n")
+    words = ["replay", str(bag), "--model", str(model), "--config", str(tmp_path / "c.yaml")]
+    assert main([*words, "--out", str(tmp_path / "r")]) == 1
+    assert "walk has no odometry, and node.registration external needs" in capsys.readouterr().err
+    assert not (tmp_path / "r").exists()
+
+
+def test_a_cloud_before_the_first_odometry_does_not_change_the_others(tmp_path, model) -> None:
+    """Only that cloud has no answer; recorded odometry is used for all others."""
+    bag = walk(tmp_path / "walk", late=1)
     out = tmp_path / "r"
     assert main(["replay", str(bag), "--out", str(out), "--model", str(model)]) == 0
-    assert len(answers(out / "bag")[TOPICS[0]]) == N - 1
+    lines = lines_of(out)
+    assert [line.get("reason", "") for line in lines] == ["no_odometry", "reference", *[""] * 4]
+    T = exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.1]))
+    start = T @ exp(np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.002]))
+    first = np.reshape(lines[2]["T_odom_read"], (4, 4)) @ inverse(
+        np.reshape(lines[2]["T_ref_read"], (4, 4))
+    )
+    assert np.allclose(first, start, atol=1e-9)
 
 
 def test_the_sensor_is_where_the_node_s_parameter_says(tmp_path: Path, model: Path) -> None:
