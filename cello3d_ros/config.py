@@ -30,6 +30,10 @@ def _setting(
     )
 
 
+#: The covariance methods that the node, ``estimate --method`` and ``Estimator`` offer.
+COVARIANCE_MODES = ("cello3d", "fused", "sigma_points", "censi", "hessian", "constant")
+
+
 class Section:
     """Base of every section: checks type and range of each field when built."""
 
@@ -221,7 +225,7 @@ class NodeConfig(Section):
     covariance_mode: str = _setting(
         "cello3d",
         "what says how far a registration is to be trusted",
-        choices=("cello3d", "fused", "sigma_points", "censi", "hessian", "constant"),
+        choices=COVARIANCE_MODES,
     )
     sensor_sigma_m: float = _setting(
         0.01, "range noise that censi, hessian and sigma_points assume", 1e-6, 10.0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cello3d_ros.config import COVARIANCE_MODES
 from cello3d_ros.errors import CloudError, RecordingError
 from cello3d_ros.geometry.se3 import Array, is_rigid
 
@@ -28,8 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--method",
-        choices=("model", "fused", "sigma_points", "censi", "hessian", "constant"),
-        default="model",
+        choices=COVARIANCE_MODES,
+        default="cello3d",
         help="what says how far the registration is to be trusted",
     )
     parser.add_argument("--seed", type=int, default=0, help="of the random subsamples")
@@ -39,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Print the pose and the covariance of one pair."""
     from cello3d_ros.clouds.shape import Cloud, prepare
-    from cello3d_ros.covariance.estimator import estimate
+    from cello3d_ros.covariance.estimator import Estimator
     from cello3d_ros.covariance.model import find_model, load_model
     from cello3d_ros.recordings.files import read_cloud
 
@@ -54,9 +55,8 @@ def run(arguments: argparse.Namespace) -> None:
             raise CloudError(f"{path}: {error}") from None
 
     reading, reference = cloud(arguments.reading), cloud(arguments.reference)
-    answer = as_dict(
-        estimate(reading, reference, T_init, model, model.pipeline, rng, arguments.method)
-    )
+    estimator = Estimator(model, arguments.method)
+    answer = as_dict(estimator.register(reading, reference, T_init, rng))
     print(json.dumps(answer, indent=2) if arguments.json else _as_text(answer))
 
 

@@ -18,7 +18,7 @@ from cello3d_ros.atomic import new_file
 from cello3d_ros.errors import Cello3dError, DatasetError, RecordingError
 
 if TYPE_CHECKING:
-    from cello3d_ros.covariance.methods import MethodSettings
+    from cello3d_ros.covariance.case import MethodSettings
     from cello3d_ros.covariance.model import Model
     from cello3d_ros.evaluation.comparison import Predictions
     from cello3d_ros.learning.dataset import Dataset
@@ -109,8 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print tables and write the JSON."""
-    from cello3d_ros.config import NodeConfig
-    from cello3d_ros.covariance.methods import MethodSettings
+    from cello3d_ros.covariance.case import MethodSettings
     from cello3d_ros.covariance.model import find_model, load_model
     from cello3d_ros.evaluation.comparison import (
         from_dataset,
@@ -130,8 +129,7 @@ def run(arguments: argparse.Namespace) -> None:
         _check_writable(arguments.json)
     path = find_model(arguments.model)
     model = load_model(path)
-    quantile = NodeConfig().unknown_quantile
-    settings = MethodSettings(arguments.sensor_sigma, arguments.registrations, quantile)
+    settings = MethodSettings(arguments.sensor_sigma, arguments.registrations, widen_unknown=False)
     datasets = [open_dataset(folder) for folder in dict.fromkeys(arguments.datasets)]
     names = chosen(datasets, arguments.only)
     known = prints_of(datasets, names)
@@ -300,12 +298,12 @@ def _worst_pairs(
 
     order = sorted(
         (k for k, pair in enumerate(pairs) if not pair["flagged"]),
-        key=lambda k: -pairs[k]["kl"]["model"],
+        key=lambda k: -pairs[k]["kl"]["cello3d"],
     )
     holders = {key: dataset for dataset in datasets for key in dataset.pair_keys()}
     return [
-        seen(holders[keys[k]].read(*keys[k]), predictions.covariances["model"][k])
-        | {"kl": pairs[k]["kl"]["model"]}
+        seen(holders[keys[k]].read(*keys[k]), predictions.covariances["cello3d"][k])
+        | {"kl": pairs[k]["kl"]["cello3d"]}
         for k in order[:N_WORST]
     ]
 

@@ -100,7 +100,6 @@ def _describe_model(path: Path, _: argparse.Namespace) -> dict[str, Any]:
         "looks_at": model.features,
         "mean_weight": model.mean_weight,
         "margin": model.margin,
-        "cutoff_rho": model.cutoff_rho if np.isfinite(model.cutoff_rho) else None,
         "prior_variance": model.sampling.variance,
         **_mean_sigmas(model),
         **_lost(model),

@@ -14,19 +14,20 @@ from cello3d_ros.config import IcpConfig
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import symmetrized
 from cello3d_ros.geometry.se3 import Array, hat, transform
+from cello3d_ros.registration.overlap import Overlap
 
 
 class ClosedForm(NamedTuple):
     """Two cheap predictors, (6, 6), reading side, ordered (u, omega), and what they came from.
 
-    hessian: ``H^-1``, the covariance for point-to-plane residuals of 1 m deviation;
+    inverse_H: ``H^-1``, the covariance for point-to-plane residuals of 1 m deviation;
     sandwich: ``H^-1 (sum_i g_i g_i^T) H^-1``, what redrawing the reading does to the result to
     first order, g_i being the gradient that one reading point adds; trim_m: the distance up to
     which ICP's rules keep associations; residual_rms_m: root mean square of their point-to-plane
     residuals; n_associations: how many there are.
     """
 
-    hessian: Array
+    inverse_H: Array
     sandwich: Array
     trim_m: float
     residual_rms_m: float
@@ -37,27 +38,25 @@ def closed_form(
     reading: Cloud,
     reference: Cloud,
     T_ref_read: Array,
-    distances2: Array,
-    indices: Indices,
+    overlap: Overlap,
     config: IcpConfig,
 ) -> ClosedForm:
     """Compute both predictors from all points of two registered clouds.
 
-    distances2, indices: (N, k), the reading's neighbours (``Overlap``).  H is the point-to-plane
-    normal matrix of the associations that ICP's rules keep.  ICP draws
-    n_reading_points of the reading's N points, so both are scaled by N / n_reading_points.
-    Raises RegistrationError when the geometry leaves a direction free.
+    overlap: the clouds' associations.  H is the point-to-plane normal matrix of those that
+    ICP's rules keep.  ICP draws n_reading_points of the reading's N points, so both are scaled by
+    N / n_reading_points.  Raises RegistrationError when the geometry leaves a direction free.
     """
     assert has_shape(reference)
-    limit2 = _trim_limit(distances2, config)
+    limit2 = _trim_limit(overlap.distances2, config)
     H, G, sum2, n = _normal_matrices(
         reading.points,
         transform(T_ref_read, reading.points),
         reference.points,
         reference.normals,
         np.ascontiguousarray(T_ref_read[:3, :3]),
-        distances2,
-        indices,
+        overlap.distances2,
+        overlap.indices,
         limit2,
     )
     inverse_H = _inverse(H)
@@ -75,8 +74,7 @@ def censi(
     reading: Cloud,
     reference: Cloud,
     T_ref_read: Array,
-    distances2: Array,
-    indices: Indices,
+    overlap: Overlap,
     config: IcpConfig,
     sigma_m: float,
 ) -> Array:
@@ -87,8 +85,8 @@ def censi(
     ``T exp(xi)``; normals and associations stay.  Scaled and refused like ``closed_form``.
     Source: Prakhya et al. 2015, after Censi 2007, for the point-to-plane error.
     """
-    kept = distances2 <= _trim_limit(distances2, config)
-    J_xx, spread = _implicit_derivative(reading, reference, T_ref_read, indices, kept)
+    kept = overlap.distances2 <= _trim_limit(overlap.distances2, config)
+    J_xx, spread = _implicit_derivative(reading, reference, T_ref_read, overlap.indices, kept)
     inverse = _inverse(J_xx)
     return symmetrized(_drawn(reading, config) * sigma_m**2 * inverse @ spread @ inverse)
 
@@ -97,8 +95,7 @@ def common_bias(
     reading: Cloud,
     reference: Cloud,
     T_ref_read: Array,
-    distances2: Array,
-    indices: Indices,
+    overlap: Overlap,
     config: IcpConfig,
 ) -> Array:
     """Return ``b = H^-1 sum J``: how far a bias of 1 m of all ranges moves ICP.  (6,), xi.
@@ -106,10 +103,10 @@ def common_bias(
     The bias is along the normals, turned towards the reference's sensor.
     Source: Brossard et al. 2020, the correlated part of the sensor noise.
     """
-    kept = distances2 <= _trim_limit(distances2, config)
-    J, _ = _jacobians(reading, reference, T_ref_read, indices)
+    kept = overlap.distances2 <= _trim_limit(overlap.distances2, config)
+    J, _ = _jacobians(reading, reference, T_ref_read, overlap.indices)
     towards = np.einsum("mi,mi->m", reference.normals, reference.points) < 0.0
-    signs = np.where(towards, 1.0, -1.0)[indices] * kept
+    signs = np.where(towards, 1.0, -1.0)[overlap.indices] * kept
     H = np.einsum("nku,nkv->uv", J * kept[..., None], J, optimize=True)
     return np.asarray(_inverse(H) @ np.einsum("nku,nk->u", J, signs))
 

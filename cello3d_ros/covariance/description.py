@@ -51,10 +51,8 @@ def describe(
     radius_m, k = pipeline.overlap.radius_m, pipeline.icp.n_neighbors
     overlap = find_overlap(reading, reference, T_ref_read, radius_m, k, n_threads)
     _check_overlap(overlap, pipeline)
-    found = closed_form(
-        reading, reference, T_ref_read, overlap.distances2, overlap.indices, pipeline.icp
-    )
-    shapes = {"hessian": found.hessian, "sandwich": found.sandwich}
+    found = closed_form(reading, reference, T_ref_read, overlap, pipeline.icp)
+    shapes = {"hessian": found.inverse_H, "sandwich": found.sandwich}
     descriptors = _descriptors(reading, reference, T_ref_read, overlap, pipeline, n_rotations)
     features = global_features(reading, reference, T_ref_read, overlap, found, pipeline.icp)
     return Description(overlap.n_points, overlap.ratio, descriptors, features, shapes, overlap)

@@ -8,19 +8,12 @@ import numpy as np
 
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import Pipeline
+from cello3d_ros.covariance.case import DEFAULTS, Case, MethodSettings
 from cello3d_ros.covariance.description import describe
 from cello3d_ros.covariance.lost import covering, is_lost
-from cello3d_ros.covariance.methods import (
-    ASK_MODEL,
-    DEFAULTS,
-    METHODS,
-    MethodSettings,
-    Pair,
-    predicted,
-    widened,
-)
+from cello3d_ros.covariance.methods import ASK_MODEL, METHODS, predicted, widened
 from cello3d_ros.covariance.model import Model
-from cello3d_ros.errors import ModelError, RegistrationError
+from cello3d_ros.errors import ModelError, NotConvergedError, RegistrationError
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.backends import register
 from cello3d_ros.registration.icp import Registration
@@ -42,68 +35,91 @@ class Estimate(NamedTuple):
     covariance: Array
     nearest_rho: float
     effective_neighbors: float
-    method: str = "model"
+    method: str = "cello3d"
     novelty: float = 0.0
     is_unknown: bool = False
     is_lost: bool = False
 
 
-def estimate(
-    reading: Cloud,
-    reference: Cloud,
-    T_init: Array,
-    model: Model,
-    pipeline: Pipeline,
-    rng: np.random.Generator,
-    method: str = "model",
-    settings: MethodSettings = DEFAULTS,
-    registration: Registration | None = None,
-) -> Estimate:
-    """Register two clouds and find the covariance of the result.
+class Estimator:
+    """Registers pairs of clouds and finds the covariance of each result."""
 
-    reading: its local shape is looked at only where ``needs_shape`` says so; T_init: (4, 4), the
-    first guess of T_ref_read.  method: a name of ``METHODS``.  registration: the result of whoever
-    registered the clouds (``registered_elsewhere``); ICP is then not run and T_init not looked at.
-    A registration that reached its last iteration is returned with ``converged`` False: its
-    covariance says little.  Raises RegistrationError when ICP or the method has no answer,
-    NoOverlapError when the clouds share too little and ModelError when the model looks at the
-    descriptor and the grid is not the model's.
-    """
-    if _looks_at_descriptor(model) and pipeline.grid != model.pipeline.grid:
-        raise ModelError(f"the model was trained with {model.pipeline.grid}, not {pipeline.grid}")
-    if registration is None:
-        registration = register(reading, reference, T_init, pipeline.icp, rng)
-    if not registration.has_answer:
-        raise RegistrationError(f"ICP has no answer: {registration.reason.replace('_', ' ')}")
-    T_ref_read = registration.T_ref_read
-    n_rotations = 1 if _looks_at_descriptor(model) else 0
-    description = describe(
-        reading, reference, T_ref_read, pipeline, n_rotations, settings.n_threads
-    )
-    pair = Pair(reading, reference, registration, description)
-    prediction = predicted(pair, model)
-    if method == "model":
-        Y = widened(prediction, pair, pipeline, model, rng, settings)
-    else:
-        Y = METHODS[method](pair, pipeline, model, rng, settings)
-    lost = is_lost(description.shapes["sandwich"], model.lost)
-    if model.lost is not None and lost and method in ASK_MODEL:
-        Y = covering(Y, model.lost)
-    return Estimate(
-        registration,
-        description.overlap_ratio,
-        settings.scale * Y,
-        prediction.nearest_rho,
-        prediction.effective_neighbors,
-        method,
-        prediction.novelty,
-        prediction.novelty > settings.unknown_quantile,
-        lost,
-    )
+    def __init__(
+        self,
+        model: Model,
+        method: str = "cello3d",
+        settings: MethodSettings = DEFAULTS,
+        pipeline: Pipeline | None = None,
+    ) -> None:
+        """Keep what every pair is judged by.
+
+        method: a name of ``METHODS``; pipeline: the model's, unless another is given.
+        """
+        self.model, self.method, self.settings = model, method, settings
+        self.pipeline = model.pipeline if pipeline is None else pipeline
+
+    def register(
+        self, reading: Cloud, reference: Cloud, T_init: Array, rng: np.random.Generator
+    ) -> Estimate:
+        """Register two clouds from the first guess T_init of T_ref_read (4, 4), and judge that."""
+        registration = register(reading, reference, T_init, self.pipeline.icp, rng)
+        return self.judge(reading, reference, registration, rng)
+
+    def judge(
+        self,
+        reading: Cloud,
+        reference: Cloud,
+        registration: Registration,
+        rng: np.random.Generator,
+    ) -> Estimate:
+        """Return a registration, perhaps ``registered_elsewhere``, with its covariance.
+
+        The local shape of the reading is looked at only where ``needs_shape`` says so.  Raises
+        RegistrationError when ICP or the method has no answer, NotConvergedError when ICP reached
+        its last iteration, NoOverlapError when the clouds share too little, and ModelError when
+        the model looks at the descriptor and the grid is not the model's.
+        """
+        model, pipeline = self.model, self.pipeline
+        if _looks_at_descriptor(model) and pipeline.grid != model.pipeline.grid:
+            raise ModelError(
+                f"the model was trained with {model.pipeline.grid}, not {pipeline.grid}"
+            )
+        if not registration.has_answer:
+            reason = registration.reason.replace("_", " ")
+            raise RegistrationError(f"ICP has no answer: {reason}")
+        description = describe(
+            *(reading, reference, registration.T_ref_read, pipeline),
+            n_rotations=1 if _looks_at_descriptor(model) else 0,
+            n_threads=self.settings.n_threads,
+        )
+        if not registration.converged:
+            raise NotConvergedError(
+                f"ICP did not converge in {registration.n_iterations} iterations: start it nearer "
+                "to the truth or allow more (icp.max_iterations)"
+            )
+        case = Case(
+            reading, reference, registration, description, pipeline, model, rng, self.settings
+        )
+        prediction = predicted(case)
+        Y = widened(prediction, case) if self.method == "cello3d" else METHODS[self.method](case)
+        lost = is_lost(description.shapes["sandwich"], model.lost)
+        if model.lost is not None and lost and self.method in ASK_MODEL:
+            Y = covering(Y, model.lost)
+        return Estimate(
+            registration,
+            description.overlap_ratio,
+            self.settings.scale * Y,
+            prediction.nearest_rho,
+            prediction.effective_neighbors,
+            self.method,
+            prediction.novelty,
+            prediction.novelty > self.settings.unknown_quantile,
+            lost,
+        )
 
 
 def needs_shape(model: Model, pipeline: Pipeline) -> bool:
-    """Return whether ``estimate`` looks at the local shape of the reading, too.
+    """Return whether an estimate looks at the local shape of the reading, too.
 
     The descriptor does, and so do other backends than this package's ICP.
     """

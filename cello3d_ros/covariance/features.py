@@ -31,6 +31,7 @@ FEATURES = (
     "log_motion_m",
 )
 KINDS = ("descriptor", "global", "both")  # what a model may look at
+_LEAST = 1e-6  # m, rad or a ratio: stands for the nothing that exact copies leave
 _MOTION_M = 0.1  # added to the distance of the two sensors, so that its logarithm is bounded
 
 
@@ -51,15 +52,14 @@ def global_features(
     sandwich against ``rms^2 H^-1``, which independent residuals would make; how many points stand
     behind each that ICP draws, in either cloud; the distance of the two sensors.
     """
-    S, H_inverse = found.sandwich, found.hessian
-    # of exact copies nothing is left: 1 um stands for it
-    limit, rms = max(found.trim_m, 1e-6), max(found.residual_rms_m, 1e-6)
-    spread = np.sqrt([np.trace(S[:3, :3]), np.trace(S[3:, 3:])])
+    S, H_inverse = found.sandwich, found.inverse_H
+    limit, rms = max(found.trim_m, _LEAST), max(found.residual_rms_m, _LEAST)
+    spread = np.sqrt(np.maximum([np.trace(S[:3, :3]), np.trace(S[3:, 3:])], _LEAST**2))
     traces = np.trace(H_inverse[:3, :3]), np.trace(H_inverse[3:, 3:])
     unit = np.repeat(np.sqrt(3.0 / np.array(traces)), 3)
     variances, vectors = np.linalg.eigh(H_inverse * np.outer(unit, unit))
     root = unit[:, None] * vectors / np.sqrt(variances)  # root^T H^-1 root = I
-    ratios = np.maximum(np.linalg.eigvalsh(root.T @ S @ root), 1e-300) / rms**2
+    ratios = np.maximum(np.linalg.eigvalsh(root.T @ S @ root) / rms**2, _LEAST)
     against = ratios[0], np.exp(np.log(ratios).mean()), ratios[-1]
     drawn = (
         len(reading.points) / min(len(reading.points), config.n_reading_points),

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cello3d_ros.clouds.shape import Cloud
-from cello3d_ros.config import Pipeline, SamplingConfig
+from cello3d_ros.covariance.case import Case
 from cello3d_ros.covariance.sigma_points import registered_from
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import sampled_covariance, symmetrized
@@ -16,23 +15,15 @@ PRIOR_WEIGHT = 40.0  # nu: registrations that the model is worth; chosen on vali
 FEWEST = 8  # registrations below which six dimensions have no covariance to speak of
 
 
-def registrations(
-    reading: Cloud,
-    reference: Cloud,
-    T_hat: Array,
-    pipeline: Pipeline,
-    sampling: SamplingConfig,
-    n: int,
-    rng: np.random.Generator,
-    n_threads: int = 1,
-) -> Array:
-    """Return xi about T_hat of n registrations that ended where T_hat is.  (at most n, 6).
+def registrations(case: Case) -> Array:
+    """Return xi about T_hat of a few registrations that ended where T_hat is.  (at most n, 6).
 
-    Starts are ``T_hat exp(xi)``, xi ~ N(0, sampling.variance I).  Those in another minimum are no
-    errors of this one: kept is what steps of at most one clustering radius connect to T_hat.
+    n is the settings' ``n_registrations``.  Starts are ``T_hat exp(xi)``, xi ~ N(0, a I), a the
+    variance of the model's sampling.  Those in another minimum are no errors of this one: kept is
+    what steps of at most one clustering radius connect to T_hat.
     """
-    starts = rng.normal(scale=np.sqrt(sampling.variance), size=(n, 6))
-    xi = registered_from(reading, reference, T_hat, starts, pipeline, rng, n_threads)
+    sampling, n = case.model.sampling, case.settings.n_registrations
+    xi = registered_from(case, case.rng.normal(scale=np.sqrt(sampling.variance), size=(n, 6)))
     return xi[connected(xi, sampling.cluster_scale_m, sampling.cluster_scale_rad)]
 
 

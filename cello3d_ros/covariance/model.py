@@ -33,14 +33,14 @@ from cello3d_ros.config import (
 from cello3d_ros.covariance.archive import read_arrays, write_arrays
 from cello3d_ros.covariance.features import KINDS
 from cello3d_ros.covariance.lost import Lost
-from cello3d_ros.covariance.sums import squared_distances, weighted_sum
+from cello3d_ros.covariance.sums import pack, squared_distances, unpack, weighted_sum
 from cello3d_ros.errors import ConfigError, ModelError
 from cello3d_ros.geometry.gaussian import is_positive_definite, matrix_sqrt, symmetrized
-from cello3d_ros.geometry.packed import pack, unpack
 from cello3d_ros.geometry.se3 import Array
 
 FORMAT = "cello3d-model"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
+_READABLE = (2, FORMAT_VERSION)
 CONVENTIONS = {
     "order": "u omega",
     "side": "reading: T_hat = T_mean exp(xi)",
@@ -52,10 +52,8 @@ SHAPES = ("none", "hessian", "sandwich")
 
 _MAX_HEADER_BYTES = 16 * 1024**2
 _BLOCK = 65536  # covariances checked at once, bounds memory
-_ARRAYS = (
-    *("theta", "mean", "scale", "projections", "covariances"),
-    *("rho_quantiles", "neighbors_quantiles"),
-)
+_ARRAYS = ("theta", "mean", "scale", "projections", "covariances", "rho_quantiles")
+_NEW_ARRAYS = ("input_range", "rotations_rad", "training_mean")  # since format 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,9 +66,12 @@ class Model:
     shape: what they are relative to.  mean_weight: share of their mean in every prediction.
     margin: factor on every prediction, for what the training data leave out.
     features: what the inputs are, one of ``features.KINDS``.
-    rho_quantiles, neighbors_quantiles: (Q,) or empty, evenly spaced quantiles of the nearest rho
-    and of the effective neighbours of the training pairs, each seen from other recordings.
-    cutoff_rho: examples with ``rho - min(rho)`` beyond this weigh nothing; inf is no cut-off.
+    rho_quantiles: (Q,) or empty, evenly spaced quantiles of the nearest rho of the training
+    pairs, each seen from other recordings.
+    input_range: (2, D), least and largest inputs of the training, to which a prediction clips its
+    own; or (0, D), no clipping.
+    rotations_rad: (R,), the turns about z of each training pair, side by side in the examples.
+    training_mean: (6, 6), mean of the absolute training covariances; or (0, 6), not known.
     lost: how to tell a registration that ended in another minimum; None where nothing is known.
     provenance: recordings, seeds, versions, settings, figures; anything that JSON can hold.
     Raises ModelError naming what does not fit.  The arrays are read-only.
@@ -82,24 +83,25 @@ class Model:
     projections: Array
     covariances: Array
     rho_quantiles: Array = field(default_factory=lambda: np.zeros(0))
-    neighbors_quantiles: Array = field(default_factory=lambda: np.zeros(0))
+    input_range: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    rotations_rad: Array = field(default_factory=lambda: np.zeros(1))
+    training_mean: Array = field(default_factory=lambda: np.zeros((0, 6)))
     shape: str = "none"
     features: str = "descriptor"
     mean_weight: float = 0.0
     margin: float = 1.0
-    cutoff_rho: float = math.inf
     lost: Lost | None = None
     pipeline: Pipeline = field(default_factory=Pipeline)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in _ARRAYS:
+        for name in (*_ARRAYS, *_NEW_ARRAYS):
             object.__setattr__(self, name, _frozen(name, getattr(self, name)))
         object.__setattr__(self, "provenance", _as_json(self.provenance))
         _check_extents(self)
         _check_settings(self)
-        for name in ("mean_weight", "margin", "cutoff_rho"):
+        for name in ("mean_weight", "margin"):
             object.__setattr__(self, name, _number(name, getattr(self, name)))
         if self.lost is not None:
             object.__setattr__(self, "lost", _checked(self.lost))
@@ -153,15 +155,13 @@ def project(inputs: ArrayLike, theta: Array, mean: Array, scale: Array) -> Array
     return np.asarray(((d - mean) / scale) @ theta.T)
 
 
-def weigh(rho: Array, cutoff_rho: float = math.inf) -> Array:
+def weigh(rho: Array) -> Array:
     """Return weights proportional to ``exp(-rho)`` that sum to 1.  (..., N) -> (..., N).
 
     The minimum is subtracted first, so that the nearest example weighs most and never 0/0.
     """
     w = rho.min(axis=-1, keepdims=True) - rho
-    far = w < -cutoff_rho
     np.exp(w, out=w)
-    w[far] = 0.0
     w /= w.sum(axis=-1, keepdims=True)
     return np.asarray(w)
 
@@ -169,7 +169,9 @@ def weigh(rho: Array, cutoff_rho: float = math.inf) -> Array:
 def predict(model: Model, inputs: ArrayLike, S: ArrayLike | None = None) -> Prediction:
     """Return ``F = m S^1/2 [(1 - a) sum_k w_k Y_k + a mean(Y)] S^1/2``.
 
-    m is the model's margin, a the mean's weight.
+    m is the model's margin, a the mean's weight.  Weights are those of the inputs clipped to the
+    range of the training, beyond which nothing is known of how examples differ; the evidence is
+    that of the inputs as they are.
 
     inputs: (D,), what ``model_inputs`` gives.  S: (6, 6), the pair's shape that ``model.shape``
     names, reading side; not looked at when that is none.  Raises ModelError where either does
@@ -183,14 +185,23 @@ def predict(model: Model, inputs: ArrayLike, S: ArrayLike | None = None) -> Pred
         )
     if not np.isfinite(d).all():
         raise ModelError(f"the {model.features} input is not finite")
-    rho = squared_distances(model.projections, project(d, model.theta, model.mean, model.scale))
+    rho = _distances2(model, d)
     if not np.isfinite(nearest := float(rho.min())):
         raise ModelError("the pair is too far from every example for a distance")
-    w = weigh(rho, model.cutoff_rho)
+    if len(model.input_range):
+        clipped = np.clip(d, *model.input_range)
+        rho = rho if np.array_equal(clipped, d) else _distances2(model, clipped)
+    w = weigh(rho)
     F = unpack(weighted_sum(w, model.packed_covariances))
     F = (1.0 - model.mean_weight) * F + model.mean_weight * model.mean_covariance
     F = _scaled(model.margin * F, S, model.shape)
     return Prediction(F, nearest, float(1.0 / (w @ w)), _rank(nearest, model.rho_quantiles))
+
+
+def _distances2(model: Model, d: Array) -> Array:
+    """Return rho of every example.  (D,) -> (N,)."""
+    query = project(d, model.theta, model.mean, model.scale)
+    return squared_distances(model.projections, query)
 
 
 def constant_model(covariance: ArrayLike, n_features: int, **settings: Any) -> Model:
@@ -216,15 +227,19 @@ def save_model(model: Model, path: Path | str) -> None:
         raise ModelError(f"cannot write {path}: a setting is not finite: {error}") from None
     if len(header) > _MAX_HEADER_BYTES:
         raise ModelError(f"cannot write {path}: provenance of {len(header)} bytes is too long")
-    arrays: dict[str, NDArray[Any]] = {name: getattr(model, name) for name in _ARRAYS}
+    names = (*_ARRAYS, *_NEW_ARRAYS)
+    arrays: dict[str, NDArray[Any]] = {name: getattr(model, name) for name in names}
     write_arrays(path, {"header": np.frombuffer(header, dtype=np.uint8), **arrays})
 
 
 def load_model(path: Path | str) -> Model:
     """Read a model, every bit as saved.  Raises ModelError naming the file and what is wrong."""
     header = _read_header(path)
-    arrays = read_arrays(path, dict.fromkeys(_ARRAYS, "<f8"))
-    cutoff = header["cutoff_rho"]
+    is_new = header["format_version"] == FORMAT_VERSION
+    names = (*_ARRAYS, *_NEW_ARRAYS) if is_new else _ARRAYS
+    arrays = read_arrays(path, dict.fromkeys(names, "<f8"))
+    if not is_new:
+        arrays |= _of_format_2(header["provenance"])
     try:
         config = config_from(header["config"])
         return Model(
@@ -233,7 +248,6 @@ def load_model(path: Path | str) -> Model:
             features=header["features"],
             mean_weight=header["mean_weight"],
             margin=header["margin"],
-            cutoff_rho=math.inf if cutoff is None else cutoff,
             lost=_lost_from(header.get("lost")),
             pipeline=pipeline_of(config),
             sampling=config.sampling,
@@ -267,9 +281,17 @@ def _header(model: Model) -> dict[str, Any]:
         "features": model.features,
         "mean_weight": model.mean_weight,
         "margin": model.margin,
-        "cutoff_rho": None if math.isinf(model.cutoff_rho) else model.cutoff_rho,
         "lost": None if model.lost is None else _lost_to(model.lost),
         "provenance": model.provenance,
+    }
+
+
+def _of_format_2(provenance: Any) -> dict[str, Any]:
+    """Return what models of format 2 kept in their provenance."""
+    found = provenance if isinstance(provenance, dict) else {}
+    return {
+        "rotations_rad": found.get("rotations_rad", [0.0]),
+        "training_mean": found.get("mean_covariance", np.zeros((0, 6))),
     }
 
 
@@ -297,9 +319,9 @@ def _read_header(path: Path | str) -> dict[str, Any]:
         raise ModelError(f"{path}: the header is not JSON: {error}") from None
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ModelError(f"{path}: the header is not that of a {FORMAT} file")
-    if (version := header.get("format_version")) != FORMAT_VERSION:
+    if (version := header.get("format_version")) not in _READABLE:
         raise ModelError(
-            f"{path}: format version {version!r}, this package reads {FORMAT_VERSION}"
+            f"{path}: format version {version!r}, this package reads 2 and 3: train it again"
         )
     _check_items(header, _header(constant_model(np.eye(6), 1)), f"{path}: header")
     if header["conventions"] != CONVENTIONS:
@@ -382,16 +404,24 @@ def _check_extents(model: Model) -> None:
         "projections": (N, r),
         "covariances": (N, 6, 6),
     }
-    for name in ("rho_quantiles", "neighbors_quantiles"):
-        if (quantiles := getattr(model, name)).ndim != 1 or (np.diff(quantiles) < 0.0).any():
-            raise ModelError(f"{name} are not ascending numbers")
+    if len(model.input_range):
+        wanted["input_range"] = (2, D)
+    if len(model.training_mean):
+        wanted["training_mean"] = (6, 6)
+    if model.rho_quantiles.ndim != 1 or (np.diff(model.rho_quantiles) < 0.0).any():
+        raise ModelError("rho_quantiles are not ascending numbers")
     for name, extents in wanted.items():
         if (found := getattr(model, name).shape) != extents:
             raise ModelError(f"{name} has shape {found}, expected {extents}")
+    if len(model.input_range) and not (model.input_range[0] <= model.input_range[1]).all():
+        raise ModelError("input_range is not the least and the largest inputs")
+    turns = model.rotations_rad
+    if turns.ndim != 1 or 0.0 not in turns or N % len(turns):
+        raise ModelError(f"the model's {N} examples are not turns by {turns.tolist()} rad")
 
 
 def _check_settings(model: Model) -> None:
-    """Raise ModelError for a scale, shape, weight or cut-off out of range."""
+    """Raise ModelError for a scale, shape or weight out of range."""
     if not (model.scale > 0).all():
         raise ModelError("scale is not positive")
     if model.shape not in SHAPES:
@@ -402,8 +432,6 @@ def _check_settings(model: Model) -> None:
         raise ModelError(f"mean_weight must be in [0, 1]: {model.mean_weight!r}")
     if not 0.0 < _number("margin", model.margin) < math.inf:
         raise ModelError(f"margin must be positive and finite: {model.margin!r}")
-    if not _number("cutoff_rho", model.cutoff_rho) >= 0.0:
-        raise ModelError(f"cutoff_rho must not be negative: {model.cutoff_rho!r}")
 
 
 def _checked(lost: Lost) -> Lost:

@@ -4,7 +4,8 @@ There is no spatial index.  Projections have a dozen dimensions and more, in whi
 tree exclude next to nothing around a query, and under the Theta that training finds most examples
 have a weight that counts.  So a prediction reads every example once, 128 bytes of projections
 and 168 of covariances, and its time is that of memory (``benchmarks/prediction.py``); those that
-a cut-off or underflow leaves without weight are passed over.
+underflow leaves without weight are passed over.  Covariances are summed as their upper
+triangles, 21 numbers in place of 36.
 """
 
 from __future__ import annotations
@@ -15,7 +16,26 @@ from numpy.typing import NDArray
 
 from cello3d_ros.geometry.se3 import Array
 
+_ROWS, _COLUMNS = np.triu_indices(6)
+_PLACES = 6 * _ROWS + _COLUMNS
+
+#: (21,) how often each packed number stands in its matrix: ``tr(A B) = (A * TWICE) @ B``, packed.
+TWICE: Array = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
+
 _BLOCK = 1024  # rows summed apart, so that rounding does not grow with the number of rows
+
+
+def pack(Y: Array) -> Array:
+    """Return the upper triangles, row by row.  (..., 6, 6) -> (..., 21)."""
+    return np.take(Y.reshape(*Y.shape[:-2], 36), _PLACES, axis=-1)
+
+
+def unpack(packed: Array) -> Array:
+    """Return the symmetric matrices of which these are the upper triangles."""
+    Y = np.empty((*packed.shape[:-1], 6, 6))
+    Y[..., _ROWS, _COLUMNS] = packed
+    Y[..., _COLUMNS, _ROWS] = packed
+    return Y
 
 
 def squared_distances(points: Array, query: Array) -> Array:

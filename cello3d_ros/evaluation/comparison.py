@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.config import differences
-from cello3d_ros.covariance.methods import METHODS, MethodSettings, extra_runs, mean_example
+from cello3d_ros.covariance.case import MethodSettings
+from cello3d_ros.covariance.methods import METHODS, extra_runs, mean_example
 from cello3d_ros.covariance.model import Model, predict
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.evaluation.online import Answer
@@ -67,14 +68,12 @@ def training_mean(model: Model) -> Array:
     """
     if model.shape == "none":
         return mean_example(model)
-    try:
-        mean = np.array(model.provenance["mean_covariance"], np.float64).reshape(6, 6)
-    except (KeyError, TypeError, ValueError):
+    if not len(model.training_mean):
         raise DatasetError(
             "the mean of the training covariances is the baseline, and the model does not keep "
             "it; name datasets whose mean to take by --baseline"
-        ) from None
-    return mean
+        )
+    return model.training_mean
 
 
 def mean_of(datasets: Sequence[Dataset]) -> Array:
@@ -88,8 +87,8 @@ def from_dataset(
 ) -> Predictions:
     """Return what the methods that need no clouds say.
 
-    mean: (6, 6), the baseline.  ``model_widened`` is what the node makes of the model's answer by
-    default: the larger of it and the mean of the examples beyond ``settings.unknown_quantile``.
+    mean: (6, 6), the baseline.  ``cello3d_widened`` is what the node makes of the model's answer
+    by default: the larger of it and the mean of the examples beyond ``settings.unknown_quantile``.
     Raises DatasetError where the dataset's settings are not the model's: its descriptors would not
     be comparable.
     """
@@ -110,8 +109,8 @@ def from_dataset(
     constant = to_absolute(np.tile(mean_example(model), (n, 1, 1)), examples, model.shape)
     covariances = {
         BASELINE: np.tile(mean, (n, 1, 1)),
-        "model": np.array([answer.covariance for answer in answers]),
-        "model_widened": np.array(
+        "cello3d": np.array([answer.covariance for answer in answers]),
+        "cello3d_widened": np.array(
             [
                 larger(prior, answer.covariance)
                 if answer.novelty > settings.unknown_quantile

@@ -10,8 +10,9 @@ import numpy as np
 
 from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import Pipeline
+from cello3d_ros.covariance.case import Case, MethodSettings
 from cello3d_ros.covariance.description import describe
-from cello3d_ros.covariance.methods import METHODS, MethodSettings, Pair
+from cello3d_ros.covariance.methods import METHODS
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import CloudError, ModelError, RecordingError, RegistrationError
 from cello3d_ros.geometry.gaussian import is_positive_definite
@@ -80,9 +81,9 @@ def answers(
             description = describe(clouds[j], clouds[i], found.T_ref_read, model.pipeline)
         except RegistrationError:
             return {name: Answer(np.full((6, 6), np.nan), np.nan) for name in METHODS}
-        pair = Pair(clouds[j], clouds[i], found, description)
+        case = Case(clouds[j], clouds[i], found, description, model.pipeline, model, rng, settings)
         ms = 1e3 * (time.process_time() - start)
-        return {name: _answer(name, pair, ms, model, rng, settings) for name in METHODS}
+        return {name: _answer(name, case, ms) for name in METHODS}
 
     for ij in pairs[:1]:
         every(*ij)  # compiles what there is to compile, so that the times below are without it
@@ -90,17 +91,10 @@ def answers(
         yield every(*ij)
 
 
-def _answer(
-    name: str,
-    pair: Pair,
-    described_ms: float,
-    model: Model,
-    rng: np.random.Generator,
-    settings: MethodSettings,
-) -> Answer:
+def _answer(name: str, case: Case, described_ms: float) -> Answer:
     start = time.process_time()
     try:
-        Y = METHODS[name](pair, model.pipeline, model, rng, settings)
+        Y = METHODS[name](case)
     except (RegistrationError, ModelError):
         Y = np.full((6, 6), np.nan)
     cpu_ms = described_ms + 1e3 * (time.process_time() - start)

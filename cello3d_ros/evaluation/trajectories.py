@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from cello3d_ros.clouds.shape import Cloud
-from cello3d_ros.covariance.estimator import estimate
+from cello3d_ros.covariance.case import DEFAULTS
+from cello3d_ros.covariance.estimator import Estimator
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import (
@@ -147,12 +148,13 @@ def _run(
 ) -> _Run | None:
     """Return one odometry; None without an answer."""
     sampling = model.sampling
+    estimator = Estimator(model, settings=DEFAULTS._replace(widen_unknown=False))
     steps, is_lost, is_told = [], False, False
     for k in range(1, len(clouds)):
         T_mean = inverse(T_world_sensor[k - 1]) @ T_world_sensor[k]
         T_init = T_mean @ exp(rng.normal(scale=np.sqrt(sampling.variance), size=6))
         try:
-            step = estimate(clouds[k], clouds[k - 1], T_init, model, model.pipeline, rng)
+            step = estimator.register(clouds[k], clouds[k - 1], T_init, rng)
         except RegistrationError:
             return None
         T_hat = step.registration.T_ref_read

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cello3d_ros.config import TrainingConfig
-from cello3d_ros.geometry.packed import TWICE, pack, unpack
+from cello3d_ros.covariance.sums import TWICE, pack, unpack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.examples import (
     Examples,
@@ -156,17 +156,16 @@ def predicted(theta: Array, problem: Problem) -> Array:
     )
 
 
-def evidence(theta: Array, problem: Problem) -> tuple[Array, Array]:
-    """Return each target's nearest rho and effective neighbours ``1 / sum s^2``.  (K,), (K,)."""
+def nearest_rho(theta: Array, problem: Problem) -> Array:
+    """Return the rho of each target's nearest example.  (K,)."""
     P_examples = _projected(problem.X_examples, theta)
-    nearest, neighbors = [], []
+    nearest = []
     for block in _blocks(len(problem.X)):
         P = _projected(problem.X[block], theta)
         s = _weights(P, P_examples, problem, block)
         offset = P - P_examples[s.argmax(axis=1)]
         nearest.append(np.einsum("kr,kr->k", offset, offset))
-        neighbors.append(1.0 / np.einsum("kj,kj->k", s, s))
-    return np.concatenate(nearest), np.concatenate(neighbors)
+    return np.concatenate(nearest)
 
 
 def pair_losses(F: Array, Y: Array, loss: str) -> tuple[Array, Array]:

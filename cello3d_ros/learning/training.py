@@ -16,9 +16,9 @@ from scipy.optimize import minimize
 from cello3d_ros.config import TrainingConfig
 from cello3d_ros.covariance.lost import Lost, spread_m
 from cello3d_ros.covariance.model import Model, project
+from cello3d_ros.covariance.sums import unpack
 from cello3d_ros.errors import ConfigError, DatasetError
 from cello3d_ros.geometry.gaussian import sampled_covariance
-from cello3d_ros.geometry.packed import unpack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import package_versions
 from cello3d_ros.learning.examples import (
@@ -29,11 +29,11 @@ from cello3d_ros.learning.examples import (
 )
 from cello3d_ros.learning.loss import (
     Problem,
-    evidence,
     expand_features,
     leave_out_problem,
     loss_and_gradient,
     median_rho,
+    nearest_rho,
     pair_losses,
     predicted,
     select_features,
@@ -104,15 +104,12 @@ def train(
         "recordings": examples.n_pairs,
         "validation_recordings": {} if validation is None else validation.n_pairs,
         "rejected_pairs": examples.rejected,
-        "mean_covariance": examples.covariances.mean(axis=0).tolist(),
-        "rotations_rad": examples.rotations_rad.tolist(),
         "training": dataclasses.asdict(config),
         "iterations": search.n_iterations,
         "best_iteration": search.best_iteration,
         "figures": figures,
         "versions": package_versions(),
     }
-    nearest, neighbors = evidence(theta, problem)
     model = Model(
         theta=theta,
         mean=mean,
@@ -121,8 +118,10 @@ def train(
         covariances=unpack(problem.packed_examples),
         shape=config.shape,
         features=config.features,
-        rho_quantiles=np.quantile(nearest, _LEVELS),
-        neighbors_quantiles=np.quantile(neighbors, _LEVELS),
+        rho_quantiles=np.quantile(nearest_rho(theta, problem), _LEVELS),
+        input_range=_input_range(examples, config),
+        rotations_rad=examples.rotations_rad,
+        training_mean=examples.covariances.mean(axis=0),
         mean_weight=config.mean_weight,
         margin=config.margin,
         lost=None if config.shape == "none" else known_lost(examples),
@@ -138,6 +137,17 @@ def train(
         interrupted=search.interrupted,
         curve=tuple(search.curve),
     )
+
+
+def _input_range(examples: Examples, config: TrainingConfig) -> Array:
+    """Return the least and the largest inputs; nothing for the paper's descriptor.  (2 or 0, D).
+
+    Global features are mostly logarithms and have no bounds; those of the descriptor are shares.
+    """
+    rows = flat_features(examples)
+    if config.features == "descriptor":
+        return np.zeros((0, rows.shape[1]))
+    return np.stack([rows.min(axis=0), rows.max(axis=0)])
 
 
 def known_lost(examples: Examples) -> Lost | None:

@@ -18,7 +18,7 @@ from cello3d_ros.geometry.se3 import Array, transform
 Chart = dict[str, Any]  # data and layout
 
 _COLORS = {
-    "model": "#1b7837",
+    "cello3d": "#1b7837",
     "mean_covariance": "#888888",
     "constant_relative": "#5aae61",
     "sandwich": "#d95f02",
@@ -28,7 +28,7 @@ _COLORS = {
     "monte_carlo": "#a6761d",
     "fused": "#2166ac",
 }
-_SHOWN_FIRST = ("model", "mean_covariance", "censi", "fused")  # others by a click in the legend
+_SHOWN_FIRST = ("cello3d", "mean_covariance", "censi", "fused")  # others by a click in the legend
 _REFERENCE, _READING = "#2166ac", "#b2182b"
 _SAMPLED, _PREDICTED, _DROPPED = "#1b7837", "#a040c8", "#d95f02"
 _N_SIGMA = 2.0
@@ -67,7 +67,7 @@ def calibration_chart(found: dict[str, Any]) -> Chart:
 
 def divergence_chart(pairs: list[dict[str, Any]]) -> Chart:
     """Return the KL of each pair by each method, pairs in the order of the model's."""
-    ordered = sorted(pairs, key=lambda pair: float(pair["kl"]["model"]))
+    ordered = sorted(pairs, key=lambda pair: float(pair["kl"]["cello3d"]))
     names = list(dict.fromkeys(name for pair in ordered for name in pair["kl"]))
     data = []
     for name in names:

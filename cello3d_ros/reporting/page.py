@@ -158,7 +158,7 @@ def table(caption: str, columns: _Columns, rows: Mapping[str, Mapping[str, Any]]
     lines = []
     for name, row in rows.items():
         cells = "".join(f"<td>{_cell(row.get(key), form)}</td>" for _, key, form in columns)
-        kind = ' class="chosen"' if name == "model" else ""
+        kind = ' class="chosen"' if name == "cello3d" else ""
         lines.append(f'<tr{kind}><th scope="row">{name_of(name)}</th>{cells}</tr>')
     return (
         f'<div class="scroll"><table><caption>{caption}</caption><thead><tr><td></td>{heads}'

@@ -103,7 +103,7 @@ def censi_of(
     """Return Censi's covariance of a registration T_ref_read (4, 4).  (6, 6)."""
     icp = pipeline.icp
     found = find_overlap(reading, reference, T, pipeline.overlap.radius_m, icp.n_neighbors)
-    return censi(reading, reference, T, found.distances2, found.indices, icp, sigma_m)
+    return censi(reading, reference, T, found, icp, sigma_m)
 
 
 def kept_of(xi: Array) -> NDArray[np.bool_]:

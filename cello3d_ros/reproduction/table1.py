@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cello3d_ros.covariance.methods import MethodSettings
+from cello3d_ros.covariance.case import MethodSettings
 from cello3d_ros.errors import DatasetError, RegistrationError
 from cello3d_ros.evaluation.comparison import from_dataset
 from cello3d_ros.evaluation.online import prepared
@@ -87,7 +87,7 @@ def _row(
     examples = load_examples([found[key]], names_of(found[key]))
     mean = training.covariances.mean(axis=0)
     F = {
-        name: from_dataset(model, examples, mean, MethodSettings()).covariances["model"]
+        name: from_dataset(model, examples, mean, MethodSettings()).covariances["cello3d"]
         for name, model in models.items()
     }
     F["baseline"] = np.tile(mean, (len(examples.covariances), 1, 1))

@@ -13,19 +13,16 @@ import numpy as np
 
 from cello3d_ros.clouds.shape import filtered, with_shape
 from cello3d_ros.config import NodeConfig, Pipeline
-from cello3d_ros.covariance.estimator import Estimate, estimate, needs_shape
-from cello3d_ros.covariance.methods import METHODS, MethodSettings
+from cello3d_ros.covariance.case import MethodSettings
+from cello3d_ros.covariance.estimator import Estimate, Estimator, needs_shape
 from cello3d_ros.covariance.model import Model
-from cello3d_ros.errors import ModelError, NotConvergedError, RegistrationError
+from cello3d_ros.errors import ModelError, RegistrationError
 from cello3d_ros.geometry.gaussian import GaussianPose, compound_right, is_positive_definite
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.geometry.transforms import seen_from_base
 from cello3d_ros.tracking.external import External, checked
 from cello3d_ros.tracking.guess import CONSTANT_VELOCITY, EXTERNAL, ODOMETRY, Motion, Place
 from cello3d_ros.tracking.pairing import Frame, Link, Map, makes_keyframe
-
-#: Names of METHODS by ``node.covariance_mode``.
-METHOD_OF = {"cello3d": "model"} | {name: name for name in METHODS}
 
 _ORIGIN = np.eye(4)
 _MAX_TURN2_RAD2 = 3.0  # one radian about each axis
@@ -202,20 +199,11 @@ class Tracker:
         if guess == EXTERNAL:
             limit = self.config.max_external_offset
             external = checked(*clouds, T_init, self.pipeline.icp, limit, rng)
-        found = estimate(
-            *(*clouds, T_init, self.model, self.pipeline, rng),
-            method=METHOD_OF[self.config.covariance_mode],
-            settings=self._settings(),
-            registration=None if external is None else external.registration,
-        )
-        if external is not None:
+            found = self._estimator().judge(*clouds, external.registration, rng)
             offset = external.offset
             found = found._replace(covariance=found.covariance + np.outer(offset, offset))
-        if not found.registration.converged:
-            raise NotConvergedError(
-                f"ICP did not converge in {found.registration.n_iterations} iterations "
-                f"({found.registration.reason})"
-            )
+        else:
+            found = self._estimator().register(*clouds, T_init, rng)
         T, Y = _extended(reference.T, reference.Y, found.registration.T_ref_read, found.covariance)
         return Answer(
             reading.stamp_ns,
@@ -287,9 +275,9 @@ class Tracker:
             child_frame_id=child,
         )
 
-    def _settings(self) -> MethodSettings:
+    def _estimator(self) -> Estimator:
         config = self.config
-        return MethodSettings(
+        settings = MethodSettings(
             sigma_m=config.sensor_sigma_m,
             n_registrations=config.n_registrations,
             unknown_quantile=config.unknown_quantile,
@@ -297,6 +285,7 @@ class Tracker:
             scale=config.scale,
             n_threads=_N_THREADS,
         )
+        return Estimator(self.model, config.covariance_mode, settings, self.pipeline)
 
     def _fail(self, frame: Frame) -> None:
         self.n_failures += 1

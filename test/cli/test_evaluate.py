@@ -20,8 +20,8 @@ from cello3d_ros.registration.icp import Registration
 
 METHODS = {
     "mean_covariance",
-    "model",
-    "model_widened",
+    "cello3d",
+    "cello3d_widened",
     "constant",
     "hessian",
     "hessian_scaled",
@@ -64,10 +64,13 @@ def folder(tmp_path: Path) -> Path:
     provenance = {
         "recordings": {"hall_s0": 2},
         "validation_recordings": {"hall_s1": 2},
-        "mean_covariance": np.diag([1e-3] * 6).tolist(),
     }
     model = constant_model(
-        4.0 * np.eye(6), 704, shape="sandwich", sampling=SAMPLING, provenance=provenance
+        *(4.0 * np.eye(6), 704),
+        shape="sandwich",
+        sampling=SAMPLING,
+        training_mean=np.diag([1e-3] * 6),
+        provenance=provenance,
     )
     save_model(model, tmp_path / "model.npz")
     return tmp_path
@@ -107,8 +110,8 @@ def test_figures_are_written_and_printed(folder: Path, capsys: pytest.CaptureFix
     for name, figures in report["methods"].items():
         assert set(figures) >= KEYS, name
         assert figures["ms_per_pair"] is None
-    assert report["methods"]["model"]["kl_mean"] == pytest.approx(0.0, abs=1e-9)
-    assert report["methods"]["model"]["dm2_over_6"] == pytest.approx(1.0)
+    assert report["methods"]["cello3d"]["kl_mean"] == pytest.approx(0.0, abs=1e-9)
+    assert report["methods"]["cello3d"]["dm2_over_6"] == pytest.approx(1.0)
     assert report["methods"]["sandwich_scaled"]["scale"] == pytest.approx(4.0)
     assert report["trajectories"] == {}
     assert [pair["i"] for pair in report["pairs"]] == [0, 1]
@@ -128,12 +131,12 @@ def test_what_a_report_draws_is_written(folder: Path, walk: Path) -> None:
     Y = [record("walk", i).covariance for i in range(2)]
     dm2 = [x @ np.linalg.solve(Y[k // 60], x) for k, x in enumerate(errors)]
     quantiles = dict(
-        zip(report["calibration"]["probabilities"], report["calibration"]["dm2"]["model"])
+        zip(report["calibration"]["probabilities"], report["calibration"]["dm2"]["cello3d"])
     )
     assert quantiles[0.5] == pytest.approx(np.median(dm2))
     assert quantiles[0.95] == pytest.approx(np.quantile(dm2, 0.95))
     pair = report["pairs"][0]
-    assert pair["dm2_over_6"]["model"] == pytest.approx(1.0)
+    assert pair["dm2_over_6"]["cello3d"] == pytest.approx(1.0)
     assert pair["dm2_over_6"]["sandwich"] == pytest.approx(4.0)
     assert set(pair["dm2_over_6"]) == set(pair["kl"])
     worst = report["worst_pairs"]
@@ -218,8 +221,8 @@ def test_methods_on_clouds_and_trajectories(folder: Path, walk: Path) -> None:
         assert report["methods"][name]["n_pairs"] == 2, name
         assert report["methods"][name]["ms_per_pair"] > 0.0
         assert np.isfinite(report["methods"][name]["kl_ratio"])
-    assert report["methods"]["model"]["kl_mean"] == pytest.approx(0.0, abs=1e-9)
-    assert [report["methods"][n]["icp_runs"] for n in ("model", "sigma_points", "fused")] == [
+    assert report["methods"]["cello3d"]["kl_mean"] == pytest.approx(0.0, abs=1e-9)
+    assert [report["methods"][n]["icp_runs"] for n in ("cello3d", "sigma_points", "fused")] == [
         0,
         12,
         10,
@@ -252,7 +255,7 @@ def test_some_pairs_are_enough_for_methods_on_clouds(folder: Path, walk: Path) -
     assert evaluate(folder, *words, "--online-pairs", 1, "--json", folder / "e.json") == 0
     report = json.loads((folder / "e.json").read_text())
     assert report["methods"]["censi"]["n_pairs"] == 1
-    assert report["methods"]["model"]["n_pairs"] == 2
+    assert report["methods"]["cello3d"]["n_pairs"] == 2
     assert report["trajectories"] == {}
 
 
@@ -267,7 +270,7 @@ def test_the_baseline_may_be_the_mean_of_other_datasets(
     assert main(["evaluate", *words, str(folder / "b.json"), "--baseline", words[0]]) == 0
     a, b = (json.loads((folder / name).read_text())["methods"] for name in ("a.json", "b.json"))
     assert b["mean_covariance"]["kl_mean"] < 1.0 < a["mean_covariance"]["kl_mean"]
-    assert a["model"]["kl_mean"] == b["model"]["kl_mean"]
+    assert a["cello3d"]["kl_mean"] == b["cello3d"]["kl_mean"]
 
 
 @pytest.mark.parametrize(

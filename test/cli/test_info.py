@@ -44,7 +44,6 @@ def test_a_table_shows_provenance_pipeline_and_sizes(
     rows = {line.split()[0]: line.split(maxsplit=1)[1:] for line in lines if line.strip()}
     assert rows["n_examples"] == ["1"]
     assert rows["n_features"] == ["704"]
-    assert rows["cutoff_rho"] == ["none"]
     assert rows["relative_to"] == ["none"]
     assert rows["mean_sigmas_m"] == ["0.02, 0.02, 0.02"]
     assert rows["recordings"] == ["rooms-0, wood-1"]
@@ -65,7 +64,7 @@ def test_json_holds_the_same_for_a_machine(
     assert found["path"] == str(path)
     assert found["relative_to"] == "sandwich"
     assert found["kind"] == "model file (.npz)"
-    assert found["format_version"] == 2
+    assert found["format_version"] == 3
     assert found["size_bytes"] == path.stat().st_size
     assert found["provenance"] == PROVENANCE
     assert found["sampling"] == config["sampling"]

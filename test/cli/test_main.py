@@ -48,7 +48,7 @@ def test_estimate_prints_the_pose_and_both_covariances(files, capsys):
 
 def test_estimate_is_by_the_method_that_is_named(files, capsys):
     sizes = {}
-    for method in ("model", "hessian", "fused"):
+    for method in ("cello3d", "hessian", "fused"):
         assert main(["estimate", *files, "--json", "--method", method]) == 0
         answer = json.loads(capsys.readouterr().out)
         assert answer["method"] == method

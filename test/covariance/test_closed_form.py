@@ -14,13 +14,18 @@ from cello3d_ros.covariance.closed_form import (
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.se3 import exp, inverse, log, transform
 from cello3d_ros.registration.icp import icp
+from cello3d_ros.registration.overlap import Overlap
+
+
+def overlap_of(distances2, indices):
+    """The associations of an overlap, of which closed forms need no more."""
+    return Overlap(np.empty(0), np.empty(0), distances2, indices)
 
 
 def predictors(reading, reference, T, config):
     moved = transform(T, reading.points)
-    return closed_form(
-        reading, reference, T, *nearest(reference.tree, moved, config.n_neighbors), config
-    )
+    found = overlap_of(*nearest(reference.tree, moved, config.n_neighbors))
+    return closed_form(reading, reference, T, found, config)
 
 
 def normal_matrix(points, normals):
@@ -134,7 +139,7 @@ def test_both_are_covariances_on_the_reading_side(pair):
     )
     H = J.T @ J
     g = J * residuals(np.zeros(6))[:, None]
-    np.testing.assert_allclose(found.hessian, np.linalg.inv(H), rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(found.inverse_H, np.linalg.inv(H), rtol=1e-4, atol=1e-12)
     expected = np.linalg.inv(H) @ (g.T @ g) @ np.linalg.inv(H)
     np.testing.assert_allclose(found.sandwich, expected, rtol=1e-4, atol=1e-12)
 
@@ -221,7 +226,8 @@ def test_censi_is_the_derivative_of_the_minimum_by_every_coordinate():
     expected = 0.02**2 * np.array(D).T @ np.array(D)
     share = near.sum() / near.size
     config = IcpConfig(n_neighbors=2, trim_ratio=float(share) - 1e-9, n_reading_points=18)
-    found = censi(cloud(P, normals), cloud(Q, normals), T, distances2, indices, config, 0.02)
+    overlap = overlap_of(distances2, indices)
+    found = censi(cloud(P, normals), cloud(Q, normals), T, overlap, config, 0.02)
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
         found / np.outer(scale, scale), 2.0 * expected / np.outer(scale, scale), atol=1e-6
@@ -254,24 +260,24 @@ def test_the_second_derivative_holds_away_from_the_minimum_too():
 def test_censi_grows_with_the_noise_and_refuses_free_directions(pair):
     reading, reference, T = pair
     config = IcpConfig()
-    found = nearest(reference.tree, transform(T, reading.points), config.n_neighbors)
-    small = censi(reading, reference, T, *found, config, 0.01)
-    large = censi(reading, reference, T, *found, config, 0.03)
+    found = overlap_of(*nearest(reference.tree, transform(T, reading.points), config.n_neighbors))
+    small = censi(reading, reference, T, found, config, 0.01)
+    large = censi(reading, reference, T, found, config, 0.03)
     np.testing.assert_allclose(large, 9.0 * small, rtol=1e-12)
     assert (np.linalg.eigvalsh(small) > 0).all()
     ground = prepare(
         plane(np.random.default_rng(37), 2, -1.0, 3000)[0], CloudConfig(), np.random.default_rng(0)
     )
-    itself = nearest(ground.tree, ground.points, config.n_neighbors)
+    itself = overlap_of(*nearest(ground.tree, ground.points, config.n_neighbors))
     with pytest.raises(RegistrationError, match="leaves a direction free"):
-        censi(ground, ground, np.eye(4), *itself, config, 0.01)
+        censi(ground, ground, np.eye(4), itself, config, 0.01)
 
 
 def test_the_common_bias_is_the_answer_to_equal_residuals(pair):
     reading, reference, T = pair
     every = IcpConfig(n_neighbors=1, trim_ratio=1.0)
     distances2, indices = nearest(reference.tree, transform(T, reading.points), 1)
-    b = common_bias(reading, reference, T, distances2, indices, every)
+    b = common_bias(reading, reference, T, overlap_of(distances2, indices), every)
     n = reference.normals[indices[:, 0]]
     n = np.where(np.einsum("ij,ij->i", n, reference.points[indices[:, 0]])[:, None] < 0, n, -n)
     m = n @ T[:3, :3]

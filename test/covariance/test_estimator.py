@@ -5,16 +5,19 @@ import pytest
 
 from cello3d_ros.clouds.shape import filtered, prepare
 from cello3d_ros.config import GridConfig, IcpConfig, OverlapConfig, Pipeline
+from cello3d_ros.covariance import sigma_points
+from cello3d_ros.covariance.case import MethodSettings
 from cello3d_ros.covariance.description import describe, turns
-from cello3d_ros.covariance.estimator import estimate, needs_shape, registered_elsewhere
+from cello3d_ros.covariance.estimator import Estimator, needs_shape, registered_elsewhere
 from cello3d_ros.covariance.fused import PRIOR_WEIGHT
-from cello3d_ros.covariance.methods import METHODS, MethodSettings
+from cello3d_ros.covariance.methods import METHODS
 from cello3d_ros.covariance.model import Model, constant_model, load_model, shipped_model_path
-from cello3d_ros.errors import ModelError, NoOverlapError, RegistrationError
+from cello3d_ros.errors import ModelError, NoOverlapError, NotConvergedError, RegistrationError
 from cello3d_ros.geometry.gaussian import is_positive_definite
 from cello3d_ros.geometry.se3 import exp, inverse, log, transform
 
 PIPELINE = Pipeline()
+AS_PREDICTED = MethodSettings(unknown_quantile=1.0, widen_unknown=False)
 T_TRUE = exp([0.6, -0.4, 0.1, 0.02, -0.03, 0.4])
 
 
@@ -82,8 +85,8 @@ def test_a_turned_description_is_that_of_turned_clouds(pair):
 def test_an_estimate_registers_and_predicts(pair):
     reading, reference = pair
     model = constant_model(2.0 * np.eye(6), 704, shape="sandwich")
-    found = estimate(
-        reading, reference, T_TRUE @ exp([0.05] * 6), model, PIPELINE, np.random.default_rng(1)
+    found = Estimator(model).register(
+        reading, reference, T_TRUE @ exp([0.05] * 6), np.random.default_rng(1)
     )
     assert found.registration.converged
     assert np.linalg.norm(log(inverse(T_TRUE) @ found.registration.T_ref_read)) < 0.03
@@ -98,9 +101,7 @@ def test_a_registration_from_elsewhere_is_judged_as_it_is(pair):
     model = constant_model(2.0 * np.eye(6), 704, shape="sandwich")
     T = T_TRUE @ exp([0.01, 0, 0, 0, 0, 0.002])
     rng = np.random.default_rng(1)
-    found = estimate(
-        *pair, np.full((4, 4), np.nan), model, PIPELINE, rng, registration=registered_elsewhere(T)
-    )
+    found = Estimator(model).judge(*pair, registered_elsewhere(T), rng)
     np.testing.assert_array_equal(found.registration.T_ref_read, T)
     S = describe(*pair, T, PIPELINE).shapes["sandwich"]
     np.testing.assert_allclose(found.covariance, 2.0 * S, rtol=1e-6, atol=1e-16)
@@ -109,8 +110,8 @@ def test_a_registration_from_elsewhere_is_judged_as_it_is(pair):
 def test_an_estimate_is_by_the_method_that_it_names(pair):
     model = constant_model(2.0 * np.eye(6), 704, shape="sandwich")
     found = {
-        name: estimate(*pair, T_TRUE, model, PIPELINE, np.random.default_rng(1), name)
-        for name in ("model", "fused", "sigma_points", "censi", "hessian", "constant")
+        name: Estimator(model, name).register(*pair, T_TRUE, np.random.default_rng(1))
+        for name in ("cello3d", "fused", "sigma_points", "censi", "hessian", "constant")
     }
     assert set(found) <= set(METHODS)
     for name, answer in found.items():
@@ -119,9 +120,9 @@ def test_an_estimate_is_by_the_method_that_it_names(pair):
     H = describe(*pair, found["hessian"].registration.T_ref_read, PIPELINE).shapes["hessian"]
     np.testing.assert_allclose(found["hessian"].covariance, 1e-4 * H, rtol=1e-6, atol=1e-18)
     np.testing.assert_allclose(
-        found["constant"].covariance, found["model"].covariance, rtol=1e-9, atol=1e-16
+        found["constant"].covariance, found["cello3d"].covariance, rtol=1e-9, atol=1e-16
     )
-    assert not np.allclose(found["fused"].covariance, found["model"].covariance, rtol=1e-3)
+    assert not np.allclose(found["fused"].covariance, found["cello3d"].covariance, rtol=1e-3)
 
 
 def test_clouds_that_share_too_little_are_an_error(pair):
@@ -133,13 +134,13 @@ def test_clouds_that_share_too_little_are_an_error(pair):
         describe(reading, reference, T_TRUE, strict)
 
 
-def test_an_unconverged_registration_says_so(pair):
-    reading, reference = pair
+def test_an_unconverged_registration_is_an_error_before_any_other_is_run(pair, monkeypatch):
     hasty = Pipeline(icp=IcpConfig(max_iterations=1))
-    model = constant_model(np.eye(6), 704)
-    found = estimate(reading, reference, T_TRUE, model, hasty, np.random.default_rng(1))
-    assert not found.registration.converged
-    assert found.registration.reason == "max_iterations"
+    monkeypatch.setattr(sigma_points, "register_many", None)
+    for method in ("cello3d", "fused", "sigma_points"):
+        estimator = Estimator(constant_model(np.eye(6), 704), method, pipeline=hasty)
+        with pytest.raises(NotConvergedError, match="did not converge in 1 iterations"):
+            estimator.register(*pair, T_TRUE, np.random.default_rng(1))
 
 
 def test_a_plane_has_no_answer():
@@ -147,21 +148,14 @@ def test_a_plane_has_no_answer():
     ground = rng.uniform(-8, 8, (4000, 3)) * [1, 1, 0] - [0, 0, 1.5]
     cloud = prepare(ground, PIPELINE.cloud, rng)
     with pytest.raises(RegistrationError, match=r"singular|direction free"):
-        estimate(cloud, cloud, np.eye(4), constant_model(np.eye(6), 704), PIPELINE, rng)
+        Estimator(constant_model(np.eye(6), 704)).register(cloud, cloud, np.eye(4), rng)
 
 
 def test_another_grid_than_the_models_is_refused(pair):
-    reading, reference = pair
     other = Pipeline(grid=GridConfig(n_cells=(2, 2, 2)))
+    estimator = Estimator(constant_model(np.eye(6), 704), pipeline=other)
     with pytest.raises(ModelError, match="trained with GridConfig"):
-        estimate(
-            reading,
-            reference,
-            T_TRUE,
-            constant_model(np.eye(6), 704),
-            other,
-            np.random.default_rng(0),
-        )
+        estimator.register(*pair, T_TRUE, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -172,7 +166,7 @@ def test_nobody_looks_at_the_shape_of_the_reading_who_has_not_said_so(pair, room
     np.testing.assert_array_equal(bare.points, pair[0].points)
     assert len(bare.normals) == 0
     one, other = (
-        estimate(cloud, pair[1], T_TRUE, model, PIPELINE, np.random.default_rng(1), method)
+        Estimator(model, method).register(cloud, pair[1], T_TRUE, np.random.default_rng(1))
         for cloud in (pair[0], bare)
     )
     np.testing.assert_array_equal(one.covariance, other.covariance)
@@ -197,13 +191,13 @@ def two_examples(pair, far: float):
     )
 
 
-@pytest.mark.parametrize("method", ["model", "fused"])
+@pytest.mark.parametrize("method", ["cello3d", "fused"])
 def test_a_prediction_far_from_every_example_is_widened_to_their_mean(pair, method):
     model = two_examples(pair, 3.0)
     settings = MethodSettings(unknown_quantile=0.5, widen_unknown=True)
     rng = [np.random.default_rng(5) for _ in range(3)]
-    plain = estimate(*pair, T_TRUE, model, PIPELINE, rng[0], method)
-    found = estimate(*pair, T_TRUE, model, PIPELINE, rng[1], method, settings)
+    plain = Estimator(model, method, AS_PREDICTED).register(*pair, T_TRUE, rng[0])
+    found = Estimator(model, method, settings).register(*pair, T_TRUE, rng[1])
     mean = model.covariances.mean(axis=0)
     if method == "fused":  # twelve registrations weigh in
         mean = mean * PRIOR_WEIGHT / (PRIOR_WEIGHT + settings.n_registrations)
@@ -213,7 +207,7 @@ def test_a_prediction_far_from_every_example_is_widened_to_their_mean(pair, meth
         assert np.linalg.eigvalsh(found.covariance - smaller)[0] > -1e-15
     assert np.linalg.eigvalsh(found.covariance - plain.covariance)[-1] > 1e-3
     near = two_examples(pair, 0.5)
-    kept = estimate(*pair, T_TRUE, near, PIPELINE, rng[2], method, settings)
+    kept = Estimator(near, method, settings).register(*pair, T_TRUE, rng[2])
     assert np.linalg.eigvalsh(kept.covariance)[-1] < 1e-3
     assert not kept.is_unknown
 
@@ -221,8 +215,8 @@ def test_a_prediction_far_from_every_example_is_widened_to_their_mean(pair, meth
 def test_what_does_not_come_from_the_model_is_not_widened(pair):
     model, rng = two_examples(pair, 3.0), [np.random.default_rng(5) for _ in range(2)]
     settings = MethodSettings(unknown_quantile=0.5, widen_unknown=True)
-    plain = estimate(*pair, T_TRUE, model, PIPELINE, rng[0], "hessian")
-    found = estimate(*pair, T_TRUE, model, PIPELINE, rng[1], "hessian", settings)
+    plain = Estimator(model, "hessian", AS_PREDICTED).register(*pair, T_TRUE, rng[0])
+    found = Estimator(model, "hessian", settings).register(*pair, T_TRUE, rng[1])
     np.testing.assert_array_equal(found.covariance, plain.covariance)
     assert found.is_unknown
 
@@ -230,9 +224,9 @@ def test_what_does_not_come_from_the_model_is_not_widened(pair):
 def test_an_answer_far_from_every_example_is_only_told_of_unless_it_is_to_be_widened(pair):
     model = two_examples(pair, 3.0)
     rng = [np.random.default_rng(5) for _ in range(2)]
-    plain = estimate(*pair, T_TRUE, model, PIPELINE, rng[0])
-    settings = MethodSettings(unknown_quantile=0.5)
-    found = estimate(*pair, T_TRUE, model, PIPELINE, rng[1], settings=settings)
+    plain = Estimator(model, settings=AS_PREDICTED).register(*pair, T_TRUE, rng[0])
+    settings = MethodSettings(unknown_quantile=0.5, widen_unknown=False)
+    found = Estimator(model, settings=settings).register(*pair, T_TRUE, rng[1])
     np.testing.assert_array_equal(found.covariance, plain.covariance)
     assert found.is_unknown
 
@@ -240,9 +234,8 @@ def test_an_answer_far_from_every_example_is_only_told_of_unless_it_is_to_be_wid
 def test_an_answer_is_scaled_last(pair):
     model = two_examples(pair, 3.0)
     plain, scaled = (
-        estimate(
-            *(*pair, T_TRUE, model, PIPELINE, np.random.default_rng(5)),
-            settings=MethodSettings(unknown_quantile=0.5, widen_unknown=True, scale=scale),
+        Estimator(model, settings=MethodSettings(unknown_quantile=0.5, scale=scale)).register(
+            *pair, T_TRUE, np.random.default_rng(5)
         )
         for scale in (1.0, 2.5)
     )

@@ -4,17 +4,12 @@ import numpy as np
 import pytest
 
 from cello3d_ros.clouds.shape import prepare
-from cello3d_ros.config import CloudConfig, Pipeline, SamplingConfig
+from cello3d_ros.config import COVARIANCE_MODES, CloudConfig, Pipeline, SamplingConfig
+from cello3d_ros.covariance.case import Case, MethodSettings
 from cello3d_ros.covariance.description import describe
 from cello3d_ros.covariance.estimator import registered_elsewhere
 from cello3d_ros.covariance.fused import connected, fused, monte_carlo, registrations
-from cello3d_ros.covariance.methods import (
-    METHODS,
-    MethodSettings,
-    Pair,
-    extra_runs,
-    mean_example,
-)
+from cello3d_ros.covariance.methods import METHODS, extra_runs, mean_example
 from cello3d_ros.covariance.model import Model, constant_model
 from cello3d_ros.errors import ModelError, RegistrationError
 from cello3d_ros.geometry.gaussian import is_positive_definite, kl
@@ -30,9 +25,12 @@ def pair(room):
     return reading, prepare(room[1], CloudConfig(), rng)
 
 
-def described_pair(pair):
+def case(pair, model, seed=0, **settings):
     """The pair as registered at T_HAT by someone else."""
-    return Pair(*pair, registered_elsewhere(T_HAT), describe(*pair, T_HAT, Pipeline()))
+    return Case(
+        *(*pair, registered_elsewhere(T_HAT), describe(*pair, T_HAT, Pipeline()), Pipeline()),
+        *(model, np.random.default_rng(seed), MethodSettings(**settings)),
+    )
 
 
 def test_fusion_is_the_weighted_mean_of_prior_and_scatter():
@@ -76,13 +74,13 @@ def test_monte_carlo_is_the_sample_covariance():
 
 
 def test_registrations_scatter_about_the_reported_one(pair):
-    sampling = SamplingConfig(variance=1e-3)
-    xi = registrations(*pair, T_HAT, Pipeline(), sampling, 10, np.random.default_rng(4))
+    model = constant_model(np.eye(6), 704, sampling=SamplingConfig(variance=1e-3))
+    xi = registrations(case(pair, model, 4, n_registrations=10))
     assert 8 <= len(xi) <= 10
     assert 0.0 < np.abs(xi).max() < 0.1
     assert len(np.unique(xi[:, 0])) == len(xi)
-    rng = np.random.default_rng(4)
-    assert (registrations(*pair, T_HAT, Pipeline(), sampling, 10, rng, n_threads=3) == xi).all()
+    again = registrations(case(pair, model, 4, n_registrations=10, n_threads=3))
+    np.testing.assert_array_equal(again, xi)
 
 
 def test_every_method_gives_a_covariance_and_repeats_itself(pair):
@@ -92,14 +90,9 @@ def test_every_method_gives_a_covariance_and_repeats_itself(pair):
         shape="sandwich",
         sampling=SamplingConfig(variance=1e-3),
     )
-    described = described_pair(pair)
+    assert set(COVARIANCE_MODES) <= set(METHODS)
     for name, method in METHODS.items():
-        found = [
-            method(
-                described, Pipeline(), model, np.random.default_rng(6), MethodSettings(0.01, 10)
-            )
-            for _ in range(2)
-        ]
+        found = [method(case(pair, model, 6, n_registrations=10)) for _ in range(2)]
         assert found[0].shape == (6, 6)
         assert is_positive_definite(found[0]), name
         np.testing.assert_array_equal(found[0], found[1])
@@ -109,8 +102,7 @@ def test_every_method_gives_a_covariance_and_repeats_itself(pair):
 def test_constant_and_model_agree_when_there_is_one_example(pair):
     for shape in ("none", "hessian", "sandwich"):
         model = constant_model(np.diag([3.0, 1, 2, 1, 1, 4]), 704, shape=shape)
-        rest = (Pipeline(), model, np.random.default_rng(0), MethodSettings())
-        a, b = (METHODS[name](described_pair(pair), *rest) for name in ("model", "constant"))
+        a, b = (METHODS[name](case(pair, model)) for name in ("cello3d", "constant"))
         np.testing.assert_allclose(a, b, rtol=1e-9)
 
 
@@ -135,11 +127,11 @@ def test_the_mean_example_is_without_turned_copies():
             scale=np.ones(2),
             projections=np.zeros((4, 1)),
             covariances=covariances,
-            provenance={"rotations_rad": rotations},
+            rotations_rad=rotations,
         )
 
     np.testing.assert_array_equal(mean_example(model([0.0, 1.0])), 2.0 * np.eye(6))
     np.testing.assert_array_equal(mean_example(model([1.0, 0.0])), 20.0 * np.eye(6))
     for rotations in ([1.0, 2.0], [0.0, 1.0, 2.0]):
         with pytest.raises(ModelError, match="4 examples are not turns"):
-            mean_example(model(rotations))
+            model(rotations)

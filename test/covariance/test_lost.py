@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from cello3d_ros.clouds.shape import Cloud, prepare
-from cello3d_ros.config import IcpConfig, Pipeline
+from cello3d_ros.config import Pipeline
 from cello3d_ros.covariance.description import describe
-from cello3d_ros.covariance.estimator import estimate
+from cello3d_ros.covariance.estimator import Estimator
 from cello3d_ros.covariance.lost import Lost, covering, is_lost, spread_m
 from cello3d_ros.covariance.model import Model, constant_model
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log, transform
@@ -55,20 +55,20 @@ def test_what_covers_is_nowhere_narrower_than_either() -> None:
 
 def test_a_wrong_minimum_has_a_much_wider_sandwich(pair: tuple[Cloud, Cloud]) -> None:
     rng = np.random.default_rng(1)
-    wrong = estimate(*pair, T_WRONG, a_model(1e3), PIPELINE, rng).registration.T_ref_read
+    wrong = Estimator(a_model(1e3)).register(*pair, T_WRONG, rng).registration.T_ref_read
     assert np.linalg.norm(log(inverse(T_TRUE) @ wrong)[3:]) > 1.0
-    right = estimate(*pair, T_TRUE, a_model(1e3), PIPELINE, rng).registration.T_ref_read
+    right = Estimator(a_model(1e3)).register(*pair, T_TRUE, rng).registration.T_ref_read
     assert spread_m(sandwich(pair, wrong)) > 3.0 * spread_m(sandwich(pair, right))
 
 
-@pytest.mark.parametrize("method", ["model", "fused", "hessian"])
+@pytest.mark.parametrize("method", ["cello3d", "fused", "hessian"])
 def test_an_estimate_in_a_wrong_minimum_says_so_and_is_wide(
     pair: tuple[Cloud, Cloud], method: str
 ) -> None:
     model = a_model(2.0 * float(spread_m(sandwich(pair, T_TRUE))))
     rng = np.random.default_rng(1)
-    right = estimate(*pair, T_TRUE, model, PIPELINE, rng, method)
-    wrong = estimate(*pair, T_WRONG, model, PIPELINE, rng, method)
+    right = Estimator(model, method).register(*pair, T_TRUE, rng)
+    wrong = Estimator(model, method).register(*pair, T_WRONG, rng)
     assert (right.is_lost, wrong.is_lost) == (False, True)
     assert np.linalg.eigvalsh(right.covariance)[-1] < 1e-2
     if method == "hessian":  # does not come from the model: told of and no more
@@ -79,7 +79,5 @@ def test_an_estimate_in_a_wrong_minimum_says_so_and_is_wide(
 
 def test_a_model_that_knows_nothing_of_it_tells_of_nothing(pair: tuple[Cloud, Cloud]) -> None:
     model = constant_model(1.5 * np.eye(6), 704, shape="sandwich")
-    found = estimate(*pair, T_WRONG, model, PIPELINE, np.random.default_rng(1))
+    found = Estimator(model).register(*pair, T_WRONG, np.random.default_rng(1))
     assert not found.is_lost
-    hasty = Pipeline(icp=IcpConfig(max_iterations=1))
-    assert not estimate(*pair, T_WRONG, model, hasty, np.random.default_rng(1)).is_lost

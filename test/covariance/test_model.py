@@ -36,6 +36,7 @@ from cello3d_ros.geometry.gaussian import is_positive_definite
 from cello3d_ros.geometry.se3 import Array, adjoint, exp
 
 N, D, R = 40, 7, 3
+ARRAYS = ("theta", "mean", "scale", "projections", "covariances", "rho_quantiles")
 UNITS = np.outer([1e-2] * 3 + [1e-3] * 3, [1e-2] * 3 + [1e-3] * 3)
 
 
@@ -141,22 +142,23 @@ def test_the_mean_weight_mixes_in_the_training_mean() -> None:
     np.testing.assert_allclose(predict(a_model(mean_weight=1.0), d).covariance, mean, rtol=1e-12)
 
 
-def test_the_cutoff_drops_examples_farther_than_the_nearest_by_more() -> None:
-    d = descriptors(1, seed=12)[0]
-    model = a_model(0.5)
-    q = project(d, model.theta, model.mean, model.scale)
-    rho = np.sum((model.projections - q) ** 2, axis=1)
-    near = np.sort(rho)[:6]
-    cutoff = 0.5 * (near[4] + near[5]) - near[0]
-    kept = rho <= near[4]
-    s = np.exp(-rho[kept])
-    expected = np.einsum("k,kij->ij", s / s.sum(), model.covariances[kept])
-    found = predict(dataclasses.replace(model, cutoff_rho=cutoff), d)
-    np.testing.assert_allclose(found.covariance, expected, rtol=1e-12)
-    assert found.nearest_rho == pytest.approx(near[0])
-    assert found.effective_neighbors == pytest.approx(1 / np.sum((s / s.sum()) ** 2))
-    only = predict(dataclasses.replace(model, cutoff_rho=0.0), d)
-    np.testing.assert_allclose(only.covariance, model.covariances[np.argmin(rho)], rtol=1e-12)
+def test_inputs_beyond_the_training_are_clipped_but_not_in_the_evidence() -> None:
+    """One input, two examples at 0 and 1: far out the nearer one would be the only one."""
+    line = Model(
+        theta=np.eye(1),
+        mean=np.zeros(1),
+        scale=np.ones(1),
+        projections=np.array([[0.0], [1.0]]),
+        covariances=covariances(2),
+        rho_quantiles=np.array([0.0, 50.0, 100.0]),
+    )
+    clipping = dataclasses.replace(line, input_range=np.array([[0.0], [1.0]]))
+    inside, edge, outside = (predict(clipping, [x]) for x in (0.3, 1.0, 8.0))
+    np.testing.assert_array_equal(inside.covariance, predict(line, [0.3]).covariance)
+    np.testing.assert_array_equal(outside.covariance, edge.covariance)
+    assert outside.effective_neighbors == edge.effective_neighbors
+    assert (outside.nearest_rho, outside.novelty) == (49.0, pytest.approx(0.49))
+    assert predict(line, [8.0]).effective_neighbors == pytest.approx(1.0, abs=1e-5)
 
 
 def test_weights_sum_to_one_however_far() -> None:
@@ -280,7 +282,11 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "weight": ({"mean_weight": 1.5}, r"mean_weight must be in \[0, 1\]: 1.5"),
     "nan weight": ({"mean_weight": math.nan}, "mean_weight must be"),
     "weight type": ({"mean_weight": "0.1"}, "mean_weight must be a number: '0.1'"),
-    "cutoff": ({"cutoff_rho": -1.0}, "cutoff_rho must not be negative"),
+    "turns": ({"rotations_rad": [1.0, 2.0]}, "40 examples are not turns by"),
+    "turn count": ({"rotations_rad": [0.0, 1.0, 2.0]}, "40 examples are not turns by"),
+    "range": ({"input_range": np.zeros((2, D + 1))}, r"input_range has shape \(2, 8\)"),
+    "empty range": ({"input_range": np.eye(2, D)}, "input_range is not the least and the largest"),
+    "training mean": ({"training_mean": np.eye(5)}, r"training_mean has shape \(5, 5\)"),
     "provenance": ({"provenance": {"x": object()}}, "provenance cannot be written as JSON"),
     "list": ({"provenance": [1]}, "provenance must be a mapping"),
 }
@@ -344,13 +350,14 @@ def refused(path: Path) -> str:
     return sentence
 
 
-@pytest.mark.parametrize("cutoff", [math.inf, 12.5, 1 / 3])
-def test_a_saved_model_comes_back_bit_by_bit(tmp_path: Path, cutoff: float) -> None:
+def test_a_saved_model_comes_back_bit_by_bit(tmp_path: Path) -> None:
     model = a_model(
         math.pi,
         shape="sandwich",
         mean_weight=0.1,
-        cutoff_rho=cutoff,
+        input_range=np.array([np.zeros(D), np.full(D, 1 / 3)]),
+        rotations_rad=np.array([0.0, 1 / 3]),
+        training_mean=covariances(1, seed=8)[0],
         pipeline=Pipeline(
             cloud=CloudConfig(voxel_m=0.123456789),
             icp=IcpConfig(trim_ratio=1 / 3, error_metric="point_to_point"),
@@ -362,11 +369,11 @@ def test_a_saved_model_comes_back_bit_by_bit(tmp_path: Path, cutoff: float) -> N
     )
     save_model(model, tmp_path / "m.npz")
     back = load_model(tmp_path / "m.npz")
-    for name in ("theta", "mean", "scale", "projections", "covariances"):
+    for name in (*ARRAYS, "input_range", "rotations_rad", "training_mean"):
         ours, theirs = getattr(model, name), getattr(back, name)
         assert ours.dtype == theirs.dtype
         assert ours.tobytes() == theirs.tobytes()
-    for name in ("shape", "mean_weight", "cutoff_rho", "pipeline", "sampling", "provenance"):
+    for name in ("shape", "mean_weight", "pipeline", "sampling", "provenance"):
         assert getattr(model, name) == getattr(back, name)
     assert model.lost is not None
     assert back.lost is not None
@@ -376,6 +383,23 @@ def test_a_saved_model_comes_back_bit_by_bit(tmp_path: Path, cutoff: float) -> N
     ours, theirs = predict(model, d, S), predict(back, d, S)
     np.testing.assert_array_equal(ours.covariance, theirs.covariance)
     assert ours[1:] == theirs[1:]
+
+
+def test_a_file_of_format_2_is_read_and_keeps_what_its_provenance_says(saved: Path) -> None:
+    def older(header: dict[str, Any]) -> None:
+        header.update(format_version=2, cutoff_rho=None)
+        header["provenance"] |= {"rotations_rad": [0.5, 0.0], "mean_covariance": [[2.0] * 6] * 6}
+
+    new = load_model(saved)
+    kept = [f"{name}.npy" for name in ("header", *ARRAYS)]
+    rewrite(saved, {name: items_of(saved)[name] for name in kept})
+    change_header(saved, older)
+    old = load_model(saved)
+    assert old.rotations_rad.tolist() == [0.5, 0.0]
+    np.testing.assert_array_equal(old.training_mean, np.full((6, 6), 2.0))
+    assert not len(old.input_range)
+    d = descriptors(1, seed=21)[0]
+    np.testing.assert_array_equal(predict(old, d).covariance, predict(new, d).covariance)
 
 
 def test_a_column_ordered_array_comes_back_too(tmp_path: Path) -> None:
@@ -390,7 +414,7 @@ def test_the_same_model_makes_the_same_bytes_without_pickle(saved: Path, tmp_pat
     with np.load(saved, allow_pickle=False) as archive:
         assert {archive[name].dtype.kind for name in archive.files} == {"f", "u"}
         header = json.loads(archive["header"].tobytes())
-    assert header["format_version"] == 2
+    assert header["format_version"] == 3
     assert header["conventions"]["order"] == "u omega"
     assert header["config"]["sampling"]["variance"] == SamplingConfig().variance
 
@@ -504,13 +528,16 @@ def test_a_covariance_that_is_not_positive_definite_is_named(saved: Path) -> Non
 
 HEADERS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "format": (lambda h: h.update(format="other"), "not that of a cello3d-model file"),
-    "version": (lambda h: h.update(format_version=3), "format version 3, this package reads 2"),
+    "version": (
+        lambda h: h.update(format_version=4),
+        "format version 4, this package reads 2 and 3",
+    ),
     "no version": (lambda h: h.pop("format_version"), "format version None"),
     "order": (lambda h: h["conventions"].update(order="omega u"), "conventions are"),
     "side": (lambda h: h["conventions"].pop("side"), "conventions are"),
     "no conventions": (lambda h: h.pop("conventions"), "item 'conventions' is missing"),
     "no provenance": (lambda h: h.pop("provenance"), "item 'provenance' is missing"),
-    "no cutoff": (lambda h: h.pop("cutoff_rho"), "item 'cutoff_rho' is missing"),
+    "no margin": (lambda h: h.pop("margin"), "item 'margin' is missing"),
     "no config": (lambda h: h.pop("config"), "item 'config' is missing"),
     "config": (lambda h: h.update(config=[]), "item 'config' holds no sections"),
     "no grid": (lambda h: h["config"].pop("grid"), "section 'grid' of 'config' is missing"),
@@ -520,7 +547,7 @@ HEADERS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "section": (lambda h: h["config"].update(icp=3), "section 'icp' must hold settings"),
     "shape": (lambda h: h.update(shape=["none"]), "shape must be one of"),
     "weight": (lambda h: h.update(mean_weight=True), "mean_weight must be a number"),
-    "cutoff": (lambda h: h.update(cutoff_rho="far"), "cutoff_rho must be a number"),
+    "margin": (lambda h: h.update(margin="wide"), "margin must be a number"),
     "provenance": (lambda h: h.update(provenance="me"), "provenance must be a mapping"),
     "nan": (lambda h: h.update(provenance={"x": math.nan}), "provenance cannot"),
     "lost": (lambda h: h.update(lost=[3]), "'lost' is not a limit_m and a covariance"),
@@ -640,7 +667,8 @@ def test_a_shipped_model_is_small_and_says_what_it_was_made_of(name: str) -> Non
     assert model.features == "global"
     assert model.n_features == len(FEATURES)
     assert model.pipeline == Pipeline()
-    assert is_positive_definite(np.array(model.provenance["mean_covariance"]))
+    assert is_positive_definite(model.training_mean)
+    assert model.input_range.shape == (2, len(FEATURES))
     tested = {"11", "12", "13", "14"}  # seeds of which docs/models.md has the figures
     seen = {**model.provenance["recordings"], **model.provenance["validation_recordings"]}
     assert seen
@@ -681,10 +709,9 @@ def test_novelty_is_the_share_of_training_pairs_that_were_nearer() -> None:
     assert predict(dataclasses.replace(one, rho_quantiles=np.zeros(0)), d).novelty == 0.0
 
 
-@pytest.mark.parametrize("name", ["rho_quantiles", "neighbors_quantiles"])
-def test_quantiles_that_are_none_are_refused(name: str) -> None:
+def test_quantiles_that_are_none_are_refused() -> None:
     for values in (np.array([0.0, 2.0, 1.0]), np.zeros((2, 2))):
-        with pytest.raises(ModelError, match=f"{name} are not ascending"):
-            a_model(**{name: values})
+        with pytest.raises(ModelError, match="rho_quantiles are not ascending"):
+            a_model(rho_quantiles=values)
     with pytest.raises(ModelError, match="features must be one of"):
         a_model(features="all")

@@ -166,12 +166,12 @@ def test_methods_from_a_dataset():
     found = from_dataset(model, targets, np.diag(SIZES**2), settings)
     report = compare(found, targets, np.ones(8, np.bool_), settings)
     methods = report["methods"]
-    for name in ("model", "constant", "hessian", "hessian_scaled", "sandwich_scaled"):
+    for name in ("cello3d", "constant", "hessian", "hessian_scaled", "sandwich_scaled"):
         assert methods[name]["kl_mean"] == pytest.approx(0.0, abs=1e-9), name
     assert methods["sandwich"]["dm2_over_6"] == pytest.approx(4.0)
     assert methods["sandwich_scaled"]["scale"] == pytest.approx(4.0)
     assert methods["mean_covariance"]["kl_ratio"] == pytest.approx(1.0)
-    assert methods["model"]["ms_per_pair"] is None
+    assert methods["cello3d"]["ms_per_pair"] is None
     assert set(report["recordings"]) == {"a", "b"}
     assert report["recordings"]["a"]["n_pairs"] == 4
     assert report["n_pairs"] == 8
@@ -192,11 +192,11 @@ def test_a_pair_far_from_every_example_is_also_judged_as_it_is_widened():
     )
     settings = MethodSettings(unknown_quantile=0.99)
     found = from_dataset(model, targets, small, settings).covariances
-    np.testing.assert_array_equal(found["model_widened"][0], found["model"][0])
+    np.testing.assert_array_equal(found["cello3d_widened"][0], found["cello3d"][0])
     mean = (small + large) / 2
-    np.testing.assert_allclose(found["model"][1], small, rtol=1e-9)
+    np.testing.assert_allclose(found["cello3d"][1], small, rtol=1e-9)
     np.testing.assert_allclose(
-        np.diag(found["model_widened"][1]), np.fmax(np.diag(small), np.diag(mean))
+        np.diag(found["cello3d_widened"][1]), np.fmax(np.diag(small), np.diag(mean))
     )
 
 
@@ -204,12 +204,12 @@ def test_flagged_pairs_are_left_out():
     targets, settings = some(), MethodSettings()
     model = constant_model(4.0 * np.eye(6), 3, shape="sandwich")
     found = from_dataset(model, targets, np.eye(6), settings)
-    found.covariances["model"][1] *= 1e6
+    found.covariances["cello3d"][1] *= 1e6
     keep = np.arange(8) != 1
     report = compare(found, targets, keep, settings)
     assert report["n_pairs"] == 7
     assert report["recordings"]["b"]["n_pairs"] == 3
-    assert report["methods"]["model"]["kl_mean"] == pytest.approx(0.0, abs=1e-9)
+    assert report["methods"]["cello3d"]["kl_mean"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_answers_from_clouds_stand_beside_those_of_the_dataset():
@@ -221,9 +221,9 @@ def test_answers_from_clouds_stand_beside_those_of_the_dataset():
         found,
         [2, 5, 6],
         [
-            {"fused": Answer(2.0 * targets.covariances[2], 30.0), "model": Answer(nothing, 7.0)},
-            {"fused": Answer(nothing, 50.0), "model": Answer(nothing, 9.0)},
-            {"fused": Answer(2.0 * targets.covariances[6], 10.0), "model": Answer(nothing, 8.0)},
+            {"fused": Answer(2.0 * targets.covariances[2], 30.0), "cello3d": Answer(nothing, 7.0)},
+            {"fused": Answer(nothing, 50.0), "cello3d": Answer(nothing, 9.0)},
+            {"fused": Answer(2.0 * targets.covariances[6], 10.0), "cello3d": Answer(nothing, 8.0)},
         ],
     )
     methods = compare(found, targets, np.ones(8, np.bool_), settings)["methods"]
@@ -232,9 +232,9 @@ def test_answers_from_clouds_stand_beside_those_of_the_dataset():
     assert methods["fused"]["ms_per_pair"] == pytest.approx(30.0)
     assert methods["fused"]["icp_runs"] == 5
     assert methods["fused"]["kl_mean"] == pytest.approx(0.579442, rel=1e-5)
-    assert methods["model"]["n_pairs"] == 8  # from the dataset
-    assert methods["model"]["n_failed"] == 0
-    assert methods["model"]["ms_per_pair"] == pytest.approx(8.0)
+    assert methods["cello3d"]["n_pairs"] == 8  # from the dataset
+    assert methods["cello3d"]["n_failed"] == 0
+    assert methods["cello3d"]["ms_per_pair"] == pytest.approx(8.0)
     assert methods["censi"]["n_pairs"] == 0
     assert "fused" in divergences(found, targets, 2)
     assert "fused" not in divergences(found, targets, 5)
@@ -255,7 +255,7 @@ def test_a_dataset_without_the_models_shape_is_refused():
     settings = MethodSettings()
     absolute = from_dataset(constant_model(np.eye(6), 3), targets, np.eye(6), settings)
     methods = compare(absolute, targets, np.ones(8, np.bool_), settings)["methods"]
-    assert set(methods) == {"mean_covariance", "model", "model_widened", "constant"}
+    assert set(methods) == {"mean_covariance", "cello3d", "cello3d_widened", "constant"}
 
 
 def test_the_baseline_is_the_mean_that_the_model_was_trained_on(tmp_path):

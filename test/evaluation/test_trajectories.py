@@ -120,7 +120,7 @@ def test_odometry_ends_near_the_truth_whatever_the_threads(walk):
 
 
 def test_lost_and_failed_runs_are_counted(walk, monkeypatch):
-    real, calls = module.estimate, []
+    real, calls = module.Estimator.register, []
 
     def sometimes(*arguments):
         calls.append(None)
@@ -132,7 +132,7 @@ def test_lost_and_failed_runs_are_counted(walk, monkeypatch):
             answer = answer._replace(registration=answer.registration._replace(T_ref_read=T))
         return answer
 
-    monkeypatch.setattr(module, "estimate", sometimes)
+    monkeypatch.setattr(module.Estimator, "register", sometimes)
     runs = odometry_runs(*walk, a_model(0.01, variance=1e-3), 3)
     assert runs.n_failed == 1
     assert runs.lost.tolist() == [True, False]

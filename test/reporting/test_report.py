@@ -40,10 +40,10 @@ def an_evaluation(name: str = "walk") -> dict[str, Any]:
     rng = np.random.default_rng(0)
     xi = rng.normal(scale=0.01, size=(60, 6))
     Y = np.diag([1e-4] * 6)
-    methods = {"model": figures(1.25), "mean_covariance": figures(7.5)}
+    methods = {"cello3d": figures(1.25), "mean_covariance": figures(7.5)}
     truth = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0.5, 0]])
     pairs = [
-        {"recording": name, "i": i, "j": i + 1, "kl": {"model": 1.0 + i, "mean_covariance": 7.5}}
+        {"recording": name, "i": i, "j": i + 1, "kl": {"cello3d": 1.0 + i, "mean_covariance": 7.5}}
         for i in range(2)
     ]
     shown = {
@@ -60,7 +60,7 @@ def an_evaluation(name: str = "walk") -> dict[str, Any]:
         "pairs": pairs,
         "calibration": {
             "probabilities": PROBABILITIES,
-            "dm2": {"model": list(np.linspace(0.5, 20.0, len(PROBABILITIES)))},
+            "dm2": {"cello3d": list(np.linspace(0.5, 20.0, len(PROBABILITIES)))},
         },
         "worst_pairs": [shown],
         "trajectories": {name: {"length_m": 2.1, "n_runs": 2, "dm_6dof": 2.2, "paths": path}},
@@ -149,7 +149,7 @@ def test_clouds_are_shown_thinned_where_they_are_given(tmp_path: Path, walk: Pat
         (lambda r: r.pop("methods"), "no JSON of cello3d evaluate: it has no 'methods'"),
         (lambda r: r.update(pairs={}), "damaged: 'pairs' is not a list"),
         (lambda r: r["pairs"][0].pop("kl"), "damaged: lacks 'kl'"),
-        (lambda r: r["methods"]["model"].update(kl_mean="much"), "damaged: could not convert"),
+        (lambda r: r["methods"]["cello3d"].update(kl_mean="much"), "damaged: could not convert"),
         (lambda r: r["worst_pairs"][0].update(xi=[[1, 2]]), "damaged: cannot reshape"),
         (lambda r: r["trajectories"]["walk"].update(paths=[]), "damaged: list indices"),
     ],
