@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from cello3d_ros.atomic import new_file
 from cello3d_ros.errors import Cello3dError, RecordingError
 
 if TYPE_CHECKING:
+    from cello3d_ros.evaluation.result import ShownPair
     from cello3d_ros.geometry.se3 import Array
 
 _MOST_POINTS = 6000  # of a cloud on the page: twelve clouds of them are 1.2 MB
@@ -38,26 +39,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the page.  Raises EvaluationError for a file that is damaged or too old."""
-    from cello3d_ros.evaluation.evaluation_file import EvaluationError, read_evaluation
+    from cello3d_ros.evaluation.result import read_evaluation
     from cello3d_ros.reporting.page import page
 
     out: Path = arguments.out
     if out.is_dir() or not out.parent.is_dir():
         raise Cello3dError(f"cannot write {out}: not a file in an existing folder")
-    report = read_evaluation(arguments.evaluation)
-    try:
-        clouds = _clouds(report["worst_pairs"], arguments.recordings)
-        text = page(report, clouds)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        told = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise EvaluationError(f"{arguments.evaluation} is damaged: {told}") from None
+    found = read_evaluation(arguments.evaluation)
+    clouds = _clouds(found.worst_pairs, arguments.recordings)
+    text = page(found, clouds)
     with new_file(out) as partial:
         partial.write_text(text, encoding="utf-8")
     print(f"{out}: {len(text.encode()) / 1e6:.1f} MB, {len(clouds)} pairs with clouds")
 
 
 def _clouds(
-    pairs: list[dict[str, Any]], paths: Sequence[str]
+    pairs: Sequence[ShownPair], paths: Sequence[str]
 ) -> dict[tuple[str, int, int], tuple[Array, Array]]:
     """Return reading and reference, thinned, of the pairs whose recordings were given."""
     from cello3d_ros.recordings import open_recording
@@ -65,8 +62,8 @@ def _clouds(
     found = {}
     for path in paths:
         recording = open_recording(path)
-        wanted = [pair for pair in pairs if pair["recording"] == recording.name]
-        needed = {int(k) for pair in wanted for k in (pair["i"], pair["j"])}
+        wanted = [pair for pair in pairs if pair.recording == recording.name]
+        needed = {k for pair in wanted for k in (pair.i, pair.j)}
         scans: dict[int, Array] = {}
         if needed:
             for k, scan in zip(range(max(needed) + 1), recording):
@@ -75,8 +72,7 @@ def _clouds(
         if missing := sorted(needed - set(scans)):
             raise RecordingError(f"{path} has {len(recording)} scans, no scan {missing[0]}")
         for pair in wanted:
-            i, j = int(pair["i"]), int(pair["j"])
-            found[recording.name, i, j] = (scans[j], scans[i])
+            found[pair.recording, pair.i, pair.j] = (scans[pair.j], scans[pair.i])
     return found
 
 

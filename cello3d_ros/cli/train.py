@@ -22,7 +22,7 @@ _COLUMNS = (  # heading, figure
     ("KL mean", "kl_mean"),
     ("median", "kl_median"),
     ("trimmed", "kl_trimmed_mean"),
-    ("D2/6", "mahalanobis2_over_6"),
+    ("D2/6", "dm2_over_6"),
     ("in 95 %", "coverage_95"),
 )
 
@@ -161,12 +161,13 @@ def _report(iteration: int, training: float, validation: float) -> None:
     print(f"\r\x1b[K{line}\r", end="", file=sys.stderr, flush=True)
 
 
-def _table(name: str, figures: Figures) -> Iterator[str]:
+def _table(name: str, figures: dict[str, Figures]) -> Iterator[str]:
     """Yield the lines of one table: a predictor a row, the paper's baseline among them."""
-    n_pairs = int(figures["model"]["n_pairs"])
+    n_pairs = figures["cello3d"].n_pairs
     yield ""
     heading = f"{name.replace('_', ' ')} ({n_pairs} pairs)"
     yield f"{heading:40}" + "".join(f"{title:>10}" for title, _ in _COLUMNS)
     for predictor, measures in figures.items():
-        cells = (f"{measures[key]:10.4g}" if key in measures else " " * 10 for _, key in _COLUMNS)
-        yield f"  {predictor.replace('_', ' '):38}" + "".join(cells)
+        values = (getattr(measures, key) for _, key in _COLUMNS)
+        cells = (" " * 10 if value is None else f"{value:10.4g}" for value in values)
+        yield f"  {predictor.replace('_', ' '):38}" + "".join(cells) + f"  {measures.verdict}"

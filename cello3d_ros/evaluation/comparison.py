@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,8 @@ from cello3d_ros.covariance.methods import METHODS, extra_runs, mean_example
 from cello3d_ros.covariance.model import Model, predict
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.evaluation.online import Answer
-from cello3d_ros.geometry.gaussian import kl, larger
+from cello3d_ros.evaluation.result import Calibration, Group
+from cello3d_ros.geometry.gaussian import kl, larger, mahalanobis
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import Dataset
 from cello3d_ros.learning.examples import (
@@ -28,6 +28,8 @@ from cello3d_ros.learning.examples import (
 from cello3d_ros.learning.measures import best_scale, figures, select
 
 BASELINE = "mean_covariance"
+#: At which quantiles of D_M^2 the sampled errors are compared with chi-square.
+PROBABILITIES = (0.01, *(round(0.05 * k, 2) for k in range(1, 20)), 0.975, 0.99, 0.995)
 _SCALED = ("hessian", "sandwich", "censi", "sigma_points")
 
 
@@ -92,14 +94,8 @@ def from_dataset(
     Raises DatasetError where the dataset's settings are not the model's: its descriptors would not
     be comparable.
     """
-    found = differences(examples.pipeline, model.pipeline)
-    if model.features == "global":
-        found = [difference for difference in found if not difference.startswith("grid.")]
-    if found:
-        raise DatasetError(f"the dataset does not go with the model: {found[0]}")
+    _check_settings(model, examples)
     examples = select_inputs(examples, model.features)
-    if model.shape != "none" and model.shape not in examples.shapes:
-        raise DatasetError(f"the dataset does not hold the {model.shape} of each pair")
     n = len(examples.covariances)
     row = unturned_rows(examples).start
     S: Sequence[Array | None] = [None] * n
@@ -110,21 +106,27 @@ def from_dataset(
     covariances = {
         BASELINE: np.tile(mean, (n, 1, 1)),
         "cello3d": np.array([answer.covariance for answer in answers]),
-        "cello3d_widened": np.array(
-            [
-                larger(prior, answer.covariance)
-                if answer.novelty > settings.unknown_quantile
-                else answer.covariance
-                for answer, prior in zip(answers, constant, strict=True)
-            ]
-        ),
+        "cello3d_widened": np.array([answer.covariance for answer in answers]),
         "constant": constant,
     }
+    for k, answer in enumerate(answers):
+        if answer.novelty > settings.unknown_quantile:
+            covariances["cello3d_widened"][k] = larger(constant[k], answer.covariance)
     if "hessian" in examples.shapes:
         covariances["hessian"] = settings.sigma_m**2 * examples.shapes["hessian"]
     if "sandwich" in examples.shapes:
         covariances["sandwich"] = examples.shapes["sandwich"]
     return Predictions(covariances, {})
+
+
+def _check_settings(model: Model, examples: Examples) -> None:
+    found = differences(examples.pipeline, model.pipeline)
+    if model.features == "global":
+        found = [difference for difference in found if not difference.startswith("grid.")]
+    if found:
+        raise DatasetError(f"the dataset does not go with the model: {found[0]}")
+    if model.shape != "none" and model.shape not in examples.shapes:
+        raise DatasetError(f"the dataset does not hold the {model.shape} of each pair")
 
 
 def add_answers(
@@ -152,8 +154,8 @@ def compare(
     examples: Examples,
     keep: NDArray[np.bool_],
     settings: MethodSettings,
-) -> dict[str, Any]:
-    """Return figures of every method over the pairs to keep: overall and for each recording.
+) -> tuple[Group, dict[str, Group]]:
+    """Return the figures of every method over the pairs to keep: overall and by recording.
 
     ``<name>_scaled`` is a baseline times the one number that suits all these pairs best: an upper
     bound of what it could do, since the number is fitted to the answers.
@@ -164,46 +166,54 @@ def compare(
     F |= {f"{name}_scaled": scale * F[name] for name, scale in scales.items()}
     ms = {name: values[keep] for name, values in predictions.cpu_ms.items()}
 
-    def over(some: NDArray[np.bool_]) -> dict[str, Any]:
-        part = select(kept, some)
-        methods = {
-            name: figures(Y[some], part, F[BASELINE][some])
-            | _costs(name.removesuffix("_scaled"), Y[some], ms, some, settings)
-            for name, Y in F.items()
-        }
-        for name, scale in scales.items():
-            methods[f"{name}_scaled"]["scale"] = scale
-        return {"n_pairs": int(some.sum()), "methods": methods}
+    def over(some: NDArray[np.bool_]) -> Group:
+        part, methods = select(kept, some), {}
+        for name, Y in F.items():
+            plain = name.removesuffix("_scaled")
+            times = ms.get(plain, np.full(len(kept.groups), np.nan))[some]
+            ran = np.isfinite(times)
+            methods[name] = replace(
+                figures(Y[some], part, F[BASELINE][some]),
+                n_failed=int((ran & ~np.isfinite(Y[some]).all(axis=(1, 2))).sum()),
+                ms_per_pair=float(times[ran].mean()) if ran.any() else None,
+                icp_runs=extra_runs(plain, settings),
+                scale=scales[plain] if plain != name else None,
+            )
+        return Group(n_pairs=int(some.sum()), methods=methods)
 
-    report = over(np.ones(len(kept.groups), np.bool_))
-    report["recordings"] = {
-        str(name): over(kept.groups == name) for name in np.unique(kept.groups)
-    }
-    return report
+    everywhere = over(np.ones(len(kept.groups), np.bool_))
+    return everywhere, {str(name): over(kept.groups == name) for name in np.unique(kept.groups)}
+
+
+def calibration(
+    predictions: Predictions, examples: Examples, keep: NDArray[np.bool_]
+) -> Calibration:
+    """Return quantiles of D_M^2 of the sampled errors of all pairs to keep, by method."""
+    methods = {}
+    for name, F in predictions.covariances.items():
+        answered = np.flatnonzero(keep & np.isfinite(F).all(axis=(1, 2)))
+        if len(answered):
+            dm2 = np.concatenate([mahalanobis(examples.xi[k], F[k]) ** 2 for k in answered])
+            methods[name] = [float(q) for q in np.quantile(dm2, PROBABILITIES)]
+    return Calibration(probabilities=list(PROBABILITIES), dm2=methods)
 
 
 def divergences(predictions: Predictions, examples: Examples, pair: int) -> dict[str, float]:
     """Return the KL of one pair by every method that has an answer."""
+    Y = examples.covariances[pair]
+    return {name: float(kl(Y, F)) for name, F in _answers(predictions, pair)}
+
+
+def fits(predictions: Predictions, examples: Examples, pair: int) -> dict[str, float]:
+    """Return ``tr(F^-1 Y) / 6`` of one pair by every method that has an answer."""
+    Y = examples.covariances[pair]
     return {
-        name: float(kl(examples.covariances[pair], F[pair]))
-        for name, F in predictions.covariances.items()
-        if np.isfinite(F[pair]).all()
+        name: float(np.trace(np.linalg.solve(F, Y)) / 6.0)
+        for name, F in _answers(predictions, pair)
     }
 
 
-def _costs(
-    name: str,
-    F: Array,
-    ms: dict[str, Array],
-    some: NDArray[np.bool_],
-    settings: MethodSettings,
-) -> dict[str, Any]:
-    """Return the extra cost of a pair; ``ms_per_pair`` is None where no clouds were given."""
-    times = ms.get(name, np.full(len(some), np.nan))[some]
-    ran = np.isfinite(times)
-    failed = ran & ~np.isfinite(F).all(axis=(1, 2))
-    return {
-        "n_failed": int(failed.sum()),
-        "ms_per_pair": float(times[ran].mean()) if ran.any() else None,
-        "icp_runs": extra_runs(name, settings),
-    }
+def _answers(predictions: Predictions, pair: int) -> Iterator[tuple[str, Array]]:
+    for name, F in predictions.covariances.items():
+        if np.isfinite(F[pair]).all():
+            yield name, F[pair]

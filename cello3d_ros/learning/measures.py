@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,6 @@ from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.examples import Examples, to_absolute, to_relative
 from cello3d_ros.learning.loss import Problem, predicted
 
-Figures = dict[str, dict[str, float]]  # predictor -> measure -> value
-
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 _PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
 _TOO_SMALL, _TOO_LARGE = 1.3, 0.8  # D_M^2 / 6 beyond which a covariance has a wrong size
@@ -26,9 +25,69 @@ _TOO_SMALL, _TOO_LARGE = 1.3, 0.8  # D_M^2 / 6 beyond which a covariance has a w
 FLAG_OFFSET_M, FLAG_OFFSET_RAD, FLAG_SIGMAS = 0.05, 0.02, 3.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class Marginal:
+    """How the translation or the rotation of a method's covariances fits: as in ``Figures``."""
+
+    dm2_over_3: float
+    coverage_95: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figures:
+    """How good one method's covariances are over pairs; None where there is nothing to say.
+
+    kl_mean, kl_median, kl_trimmed_mean (without the worst 10 % of the pairs), kl_90 (the 90 %
+    quantile): divergence from the sampled covariance; kl_ratio, kl_median_ratio,
+    kl_trimmed_ratio: over that of the baseline on the same pairs.
+    dm2_over_6: mean of tr(F^-1 Y) / 6, 1 if F is right on average, above if F is too small, which
+    ``verdict`` says in words.
+    coverage_95: share of sampled errors within the 95 % ellipsoid; coverage: at ``LEVELS``.
+    n_failed: pairs without an answer; ms_per_pair: processor time; icp_runs: extra registrations
+    of a pair; scale: what a method with ``_scaled`` in its name was multiplied by.
+    """
+
+    n_pairs: int
+    kl_mean: float | None = None
+    kl_median: float | None = None
+    kl_trimmed_mean: float | None = None
+    kl_90: float | None = None
+    kl_ratio: float | None = None
+    kl_median_ratio: float | None = None
+    kl_trimmed_ratio: float | None = None
+    dm2_over_6: float | None = None
+    verdict: str = ""
+    coverage_95: float | None = None
+    coverage: list[float] = dataclasses.field(default_factory=list)
+    translation: Marginal | None = None
+    rotation: Marginal | None = None
+    n_failed: int = 0
+    ms_per_pair: float | None = None
+    icp_runs: int = 0
+    scale: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseCheck:
+    """The offset of a pair's registrations from ground truth beside their scatter."""
+
+    offset_m: float
+    scatter_m: float
+    offset_rad: float
+    scatter_rad: float
+    flagged: bool
+
+
+def verdict(ratio: float) -> str:
+    """Say in words what a mean of squared errors over those that were claimed means."""
+    if ratio > _TOO_SMALL:
+        return f"too small: multiply by {ratio:.2g}"
+    return f"too large: multiply by {ratio:.2g}" if ratio < _TOO_LARGE else "about right"
+
+
 def evaluate(
     problem: Problem, theta: Array, examples: Examples, targets: Examples, config: TrainingConfig
-) -> Figures:
+) -> dict[str, Figures]:
     """Judge the model and two constants on the targets of ``problem``.
 
     mean_covariance is the mean of the absolute covariances (the paper's baseline), of other
@@ -42,64 +101,50 @@ def evaluate(
     )
     constant = np.array([relative_means[name] for name in targets.groups])
     F = {
-        "model": to_absolute(config.margin * predicted(theta, problem), targets, config.shape),
+        "cello3d": to_absolute(config.margin * predicted(theta, problem), targets, config.shape),
         "mean_covariance": np.array([absolute_means[name] for name in targets.groups]),
         "constant": to_absolute(constant, targets, config.shape),
     }
-    return {name: measure(Fs, targets) for name, Fs in F.items()}
+    return {name: figures(Fs, targets) for name, Fs in F.items()}
 
 
-def measure(F: Array, targets: Examples) -> dict[str, float]:
-    """Return what to report: KL says how far off, D_M^2 / 6 and coverage in which direction.
-
-    kl_trimmed_mean is without the worst 10 % of the pairs.  mahalanobis2_over_6 is the mean of
-    tr(F^-1 Y) / 6, 1 if F is right on average; coverage_95 the share of sampled errors within the
-    95 % ellipsoid.
-    """
-    divergence = np.sort(kl(targets.covariances, F))
-    fit = np.trace(np.linalg.solve(F, targets.covariances), axis1=1, axis2=2)
-    measures = {
-        "n_pairs": float(len(F)),
-        "kl_mean": float(divergence.mean()),
-        "kl_median": float(np.median(divergence)),
-        "kl_trimmed_mean": float(divergence[: max(1, int(0.9 * len(F)))].mean()),
-        "mahalanobis2_over_6": float(fit.mean() / 6.0),
-    }
-    if targets.xi:
-        limit = np.sqrt(chdtri(6, 0.05))  # chi-square with 6 degrees of freedom
-        pairs = zip(targets.xi, F, strict=True)
-        inside = [np.mean(mahalanobis(xi, F_k) <= limit) for xi, F_k in pairs]
-        measures["coverage_95"] = float(np.mean(inside))
-    return measures
-
-
-def figures(F: Array, targets: Examples, baseline: Array | None = None) -> dict[str, Any]:
-    """Return everything to report of one method on the same pairs as the others.
+def figures(F: Array, targets: Examples, baseline: Array | None = None) -> Figures:
+    """Return what there is to say of one method on the same pairs as the others.
 
     F: (N, 6, 6), NaN where the method has no answer: those pairs enter no figure.
-    baseline: (N, 6, 6); ``kl_ratio``, ``kl_median_ratio`` and ``kl_trimmed_ratio`` compare with
-    its KL on the pairs that the method answered.
-    dm2_over_6 is the mean of tr(F^-1 Y) / 6, 1 if F is right on average, above if F is too small;
-    coverage_95 the share of sampled errors within the 95 % ellipsoid; coverage the same at
-    ``LEVELS``; translation and rotation the marginals, dm2_over_3 in place of dm2_over_6.
+    baseline: (N, 6, 6), to whose KL on the pairs that the method answered it is compared.
     """
     has = np.isfinite(F).all(axis=(1, 2))
     if not has.any():
-        return {"n_pairs": 0}
-    Y, F, xi = targets.covariances[has], F[has], [targets.xi[k] for k in np.flatnonzero(has)]
-    divergence = kl(Y, F)
-    report: dict[str, Any] = {"n_pairs": len(F), **_summary(divergence), **_calibration(F, Y, xi)}
-    report["direction"] = _direction(report["dm2_over_6"])
-    report["coverage"] = _coverages(F, xi, LEVELS)
-    for name, part in _PARTS.items():
-        marginal = [x[:, part] for x in xi]
-        report[name] = _calibration(F[:, part, part], Y[:, part, part], marginal)
+        return Figures(n_pairs=0)
+    Y, F = targets.covariances[has], F[has]
+    xi = [targets.xi[k] for k in np.flatnonzero(has)] if targets.xi else []
+    ours = _summary(kl(Y, F))
+    ratios: dict[str, Any] = {}
     if baseline is not None:
         theirs = _summary(kl(Y, baseline[has]))
-        report["kl_ratio"] = report["kl_mean"] / theirs["kl_mean"]
-        report["kl_median_ratio"] = report["kl_median"] / theirs["kl_median"]
-        report["kl_trimmed_ratio"] = report["kl_trimmed_mean"] / theirs["kl_trimmed_mean"]
-    return report
+        for name in ("kl", "kl_median", "kl_trimmed"):
+            key = name if name == "kl_median" else f"{name}_mean"
+            ratios[f"{name}_ratio"] = ours[key] / theirs[key]
+    dm2 = float(_normalized(F, Y).mean())
+    translation, rotation = (
+        Marginal(
+            dm2_over_3=float(_normalized(F[:, axes, axes], Y[:, axes, axes]).mean()),
+            coverage_95=_coverage_95(F[:, axes, axes], [x[:, axes] for x in xi]),
+        )
+        for axes in _PARTS.values()
+    )
+    return Figures(
+        n_pairs=len(F),
+        **ours,
+        **ratios,
+        dm2_over_6=dm2,
+        verdict=verdict(dm2),
+        coverage_95=_coverage_95(F, xi),
+        coverage=_coverages(F, xi, LEVELS) if xi else [],
+        translation=translation,
+        rotation=rotation,
+    )
 
 
 def best_scale(F: Array, targets: Examples) -> float:
@@ -113,7 +158,7 @@ def best_scale(F: Array, targets: Examples) -> float:
     return float(_normalized(F[has], targets.covariances[has]).mean())
 
 
-def pose_check(xi: Array) -> dict[str, Any]:
+def pose_check(xi: Array) -> PoseCheck:
     """Compare the offset of a pair's converged registrations from ground truth to their scatter.
 
     xi: (n, 6), errors about ground truth.  offset_m, offset_rad: norms of their mean; scatter_m,
@@ -124,16 +169,16 @@ def pose_check(xi: Array) -> dict[str, Any]:
     SLAM; where they are exact (simulation) they are ICP's own bias, and nothing is to be flagged.
     """
     mean, spread = xi.mean(axis=0), xi.std(axis=0, ddof=1)
-    check: dict[str, Any] = {"flagged": False}
-    for unit, part, limit in (
-        ("m", _PARTS["translation"], FLAG_OFFSET_M),
-        ("rad", _PARTS["rotation"], FLAG_OFFSET_RAD),
-    ):
-        offset = float(np.linalg.norm(mean[part]))
-        scatter = float(np.linalg.norm(spread[part]))
-        check |= {f"offset_{unit}": offset, f"scatter_{unit}": scatter}
-        check["flagged"] |= offset > max(limit, FLAG_SIGMAS * scatter)
-    return check
+    offset_m, offset_rad = (float(np.linalg.norm(mean[part])) for part in _PARTS.values())
+    scatter_m, scatter_rad = (float(np.linalg.norm(spread[part])) for part in _PARTS.values())
+    return PoseCheck(
+        offset_m=offset_m,
+        scatter_m=scatter_m,
+        offset_rad=offset_rad,
+        scatter_rad=scatter_rad,
+        flagged=offset_m > max(FLAG_OFFSET_M, FLAG_SIGMAS * scatter_m)
+        or offset_rad > max(FLAG_OFFSET_RAD, FLAG_SIGMAS * scatter_rad),
+    )
 
 
 def select(examples: Examples, keep: NDArray[np.bool_]) -> Examples:
@@ -149,7 +194,7 @@ def select(examples: Examples, keep: NDArray[np.bool_]) -> Examples:
     )
 
 
-def _summary(divergence: Array) -> dict[str, float]:
+def _summary(divergence: Array) -> dict[str, Any]:
     """Return mean, median, mean without the worst 10 %, and 90 % quantile."""
     ordered = np.sort(divergence)
     return {
@@ -165,24 +210,14 @@ def _normalized(F: Array, Y: Array) -> Array:
     return np.asarray(np.trace(np.linalg.solve(F, Y), axis1=1, axis2=2) / F.shape[-1])
 
 
-def _calibration(F: Array, Y: Array, xi: list[Array]) -> dict[str, float]:
-    d = F.shape[-1]
-    return {
-        f"dm2_over_{d}": float(_normalized(F, Y).mean()),
-        "coverage_95": _coverages(F, xi, (0.95,))[0],
-    }
+def _coverage_95(F: Array, xi: Sequence[Array]) -> float | None:
+    return _coverages(F, xi, (0.95,))[0] if xi else None
 
 
-def _coverages(F: Array, xi: list[Array], levels: Sequence[float]) -> list[float]:
+def _coverages(F: Array, xi: Sequence[Array], levels: Sequence[float]) -> list[float]:
     """Return the mean share of each pair's errors within the ellipsoid of each level."""
     limits = np.sqrt(chdtri(F.shape[-1], 1.0 - np.array(levels)))
     inside = [
         (mahalanobis(x, F_k)[:, None] <= limits).mean(axis=0) for x, F_k in zip(xi, F, strict=True)
     ]
     return [float(share) for share in np.mean(inside, axis=0)]
-
-
-def _direction(dm2: float) -> str:
-    if dm2 > _TOO_SMALL:
-        return "too small"
-    return "too large" if dm2 < _TOO_LARGE else "right"

@@ -56,13 +56,13 @@ _FEWEST_LOST = 30  # registrations in other minima that make a covariance
 class Training:
     """A trained model and how good it is.
 
-    figures: for "leave_recording_out" and, if there was one, "validation": predictor -> measure.
+    figures: for "leave_recording_out" and, if there was one, "validation": predictor -> figures.
     n_iterations: steps made; best_iteration: the one whose Theta was kept (0 is before any).
     curve: what ``progress`` was told, step by step.
     """
 
     model: Model
-    figures: dict[str, Figures]
+    figures: dict[str, dict[str, Figures]]
     n_iterations: int
     best_iteration: int
     interrupted: bool
@@ -107,7 +107,10 @@ def train(
         "training": dataclasses.asdict(config),
         "iterations": search.n_iterations,
         "best_iteration": search.best_iteration,
-        "figures": figures,
+        "figures": {
+            name: {predictor: dataclasses.asdict(f) for predictor, f in by.items()}
+            for name, by in figures.items()
+        },
         "versions": package_versions(),
     }
     model = Model(

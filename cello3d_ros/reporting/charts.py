@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import base64
 import html
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
+from cello3d_ros.evaluation.result import Calibration, Pair, Paths, ShownPair
 from cello3d_ros.geometry.se3 import Array, transform
 
 Chart = dict[str, Any]  # data and layout
@@ -20,7 +22,7 @@ Chart = dict[str, Any]  # data and layout
 _COLORS = {
     "cello3d": "#1b7837",
     "mean_covariance": "#888888",
-    "constant_relative": "#5aae61",
+    "constant": "#5aae61",
     "sandwich": "#d95f02",
     "hessian": "#e7298a",
     "censi": "#b2182b",
@@ -34,19 +36,19 @@ _SAMPLED, _PREDICTED, _DROPPED = "#1b7837", "#a040c8", "#d95f02"
 _N_SIGMA = 2.0
 
 
-def calibration_chart(found: dict[str, Any]) -> Chart:
+def calibration_chart(found: Calibration) -> Chart:
     """Return measured quantiles of D_M^2 over those of chi-square with 6 degrees of freedom."""
-    p = np.array(found["probabilities"], np.float64)
+    p = np.array(found.probabilities)
     ideal = chdtri(6, 1.0 - p)
     data = [
         {
             **_line(name),
             "x": ideal.tolist(),
-            "y": np.maximum(np.array(values, np.float64), 1e-9).tolist(),
+            "y": np.maximum(values, 1e-9).tolist(),
             "text": [f"{name_of(name)}, quantile {q:g}" for q in p],
             "mode": "lines+markers",
         }
-        for name, values in found["dm2"].items()
+        for name, values in found.dm2.items()
     ]
     ends = [float(ideal[0]), float(ideal[-1])]
     data.append(
@@ -65,19 +67,23 @@ def calibration_chart(found: dict[str, Any]) -> Chart:
     return {"data": data, "layout": layout}
 
 
-def divergence_chart(pairs: list[dict[str, Any]]) -> Chart:
+def divergence_chart(pairs: Sequence[Pair]) -> Chart:
     """Return the KL of each pair by each method, pairs in the order of the model's."""
-    ordered = sorted(pairs, key=lambda pair: float(pair["kl"]["cello3d"]))
-    names = list(dict.fromkeys(name for pair in ordered for name in pair["kl"]))
+    ordered = sorted(pairs, key=lambda pair: pair.kl["cello3d"])
+    names = list(dict.fromkeys(name for pair in ordered for name in pair.kl))
     data = []
     for name in names:
-        known = [(k, pair) for k, pair in enumerate(ordered, start=1) if name in pair["kl"]]
+        known = [(k, pair) for k, pair in enumerate(ordered, start=1) if name in pair.kl]
+        line = _line(name)
+        line["marker"]["symbol"] = [
+            "circle-open" if pair.flagged else "circle" for _, pair in known
+        ]
         data.append(
             {
-                **_line(name),
+                **line,
                 "mode": "markers",
                 "x": [k for k, _ in known],
-                "y": [max(float(pair["kl"][name]), 1e-6) for _, pair in known],
+                "y": [max(pair.kl[name], 1e-6) for _, pair in known],
                 "text": [f"{pair_name(pair)}: {name_of(name)}" for _, pair in known],
             }
         )
@@ -88,51 +94,29 @@ def divergence_chart(pairs: list[dict[str, Any]]) -> Chart:
     return {"data": data, "layout": layout}
 
 
-def trajectory_chart(paths: dict[str, Any]) -> Chart:
+def trajectory_chart(paths: Paths) -> Chart:
     """Return the true path and the runs from above; ellipses of 2 sigma of the first run.
 
     Errors and ellipses are drawn larger about the truth by a factor that the axis states.
     """
-    truth = np.array(paths["truth"], np.float64)
-    runs = np.array(paths["positions"], np.float64).reshape(-1, len(truth) - 1, 3)
-    C = np.array(paths["covariances"], np.float64).reshape(*runs.shape, 3)
+    truth, C = paths.truth, paths.covariances
     factor = _magnification(truth, C)
-    runs = truth[1:] + factor * (runs - truth[1:])
-    data: list[Chart] = []
+    runs = truth[1:] + factor * (paths.positions - truth[1:])
+    data = []
     for k, run in enumerate(runs):
-        xy = np.vstack([truth[:1, :2], run[:, :2]])
-        data.append(
-            {
-                **{"x": xy[:, 0].tolist(), "y": xy[:, 1].tolist(), "mode": "lines"},
-                **{"line": {"color": "#2166ac", "width": 1}, "opacity": 0.6},
-                **{"name": "odometry", "legendgroup": "runs", "showlegend": k == 0},
-            }
-        )
+        line = _path(np.vstack([truth[:1], run]), "odometry", "#2166ac", 1)
+        data.append({**line, "opacity": 0.6, "legendgroup": "runs", "showlegend": k == 0})
     for k in range(len(truth) - 1 if len(runs) else 0):
-        x, y = _ellipse(truth[k + 1, :2], factor**2 * C[0, k, :2, :2])
         last = k == len(truth) - 2
-        data.append(
-            {
-                **{"x": x, "y": y, "mode": "lines", "legendgroup": f"ellipse{last}"},
-                "line": {"color": _SAMPLED if last else "#888888", "width": 2 if last else 1},
-                "name": f"{_N_SIGMA:g}σ {'at the end' if last else 'on the way'}",
-                "showlegend": last or k == 0,
-            }
-        )
-    data.append(
-        {
-            **{"x": truth[:, 0].tolist(), "y": truth[:, 1].tolist(), "mode": "lines"},
-            **{"line": {"color": "#8a8a8a", "width": 3, "dash": "dot"}, "name": "truth"},
-        }
-    )
+        name = f"{_N_SIGMA:g}σ {'at the end' if last else 'on the way'}"
+        ellipse = _ellipse(truth[k + 1, :2], factor**2 * C[0, k, :2, :2])
+        line = _path(ellipse, name, _SAMPLED if last else "#888888", 2 if last else 1)
+        data.append({**line, "legendgroup": f"ellipse{last}", "showlegend": last or k == 0})
+    data.append(_path(truth, "truth", "#8a8a8a", 3))
+    data[-1]["line"]["dash"] = "dot"
     if len(runs):
-        ends = runs[:, -1]
-        data.append(
-            {
-                **{"x": ends[:, 0].tolist(), "y": ends[:, 1].tolist(), "mode": "markers"},
-                **{"marker": {"color": _SAMPLED, "size": 6}, "name": "ends"},
-            }
-        )
+        ends = _path(runs[:, -1], "ends", _SAMPLED, 1)
+        data.append({**ends, "mode": "markers", "marker": {"color": _SAMPLED, "size": 6}})
     layout = {
         "xaxis": {"title": {"text": "x in m"}},
         "yaxis": {
@@ -143,11 +127,11 @@ def trajectory_chart(paths: dict[str, Any]) -> Chart:
     return {"data": data, "layout": layout}
 
 
-def samples_chart(pair: dict[str, Any]) -> Chart:
+def samples_chart(pair: ShownPair) -> Chart:
     """Return where the registrations of a pair ended, and the ellipsoids of their covariances."""
-    u = 1e3 * np.array(pair["xi"], np.float64).reshape(-1, 6)[:, :3]
-    kept = np.array(pair["kept"], np.bool_)
-    Y = [np.array(pair[key], np.float64).reshape(6, 6) for key in ("covariance", "predicted")]
+    u = 1e3 * pair.xi.reshape(-1, 6)[:, :3]
+    kept = pair.kept.astype(np.bool_)
+    Y = [pair.covariance.reshape(6, 6), pair.predicted.reshape(6, 6)]
     reach = 2.5e3 * max(float(np.sqrt(np.diag(F)[:3].max())) for F in Y)
     reach = max(reach, 1.05 * float(np.abs(u[kept]).max(initial=0.0)))
     near = (np.abs(u) <= reach).all(axis=1)
@@ -182,9 +166,9 @@ def name_of(method: str) -> str:
     return html.escape(method.replace("_", " "))
 
 
-def pair_name(pair: dict[str, Any]) -> str:
+def pair_name(pair: Pair | ShownPair) -> str:
     """Return the name of a pair for people, escaped."""
-    return html.escape(f"{pair['recording']} {int(pair['i'])}–{int(pair['j'])}")
+    return html.escape(f"{pair.recording} {pair.i}–{pair.j}")
 
 
 def _line(name: str) -> Chart:
@@ -222,12 +206,20 @@ def _ellipsoid(C: Array, name: str, color: str) -> Chart:
     }
 
 
-def _ellipse(center: Array, C: Array) -> tuple[list[float], list[float]]:
+def _path(xy: Array, name: str, color: str, width: int) -> Chart:
+    """Return a line through points (N, 2 or more)."""
+    x, y = (np.round(xy[:, axis], 6).tolist() for axis in (0, 1))
+    line = {"color": color, "width": width}
+    return {"x": x, "y": y, "mode": "lines", "name": name, "line": line}
+
+
+def _ellipse(center: Array, C: Array) -> Array:
+    """Return the outline of 2 deviations around a point.  (49, 2)."""
     values, vectors = np.linalg.eigh(C)
     angle = np.linspace(0.0, 2.0 * np.pi, 49)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    x, y = center[:, None] + _N_SIGMA * root @ np.stack([np.cos(angle), np.sin(angle)])
-    return np.round(x, 6).tolist(), np.round(y, 6).tolist()
+    outline = _N_SIGMA * root @ np.stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(center + outline.T)
 
 
 def _magnification(truth: Array, C: Array) -> float:

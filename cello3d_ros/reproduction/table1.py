@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,7 +15,7 @@ from cello3d_ros.evaluation.online import prepared
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.learning.dataset import Dataset
 from cello3d_ros.learning.examples import load_examples
-from cello3d_ros.learning.measures import figures
+from cello3d_ros.learning.measures import Figures, figures
 from cello3d_ros.recordings import Recording
 from cello3d_ros.registration.backends import register
 from cello3d_ros.reproduction import drawing
@@ -30,6 +31,8 @@ from cello3d_ros.reproduction.models import (
 from cello3d_ros.reproduction.result import Result, markdown_table
 from cello3d_ros.reproduction.scenes import censi_of
 from cello3d_ros.reproduction.sequences import SEQUENCES
+
+Row = dict[str, Figures]  # by method
 
 SIGMA_M = 0.01  # that Censi assumes
 _METHODS = ("baseline", "letter", "paper", "relative", "censi")
@@ -51,7 +54,10 @@ def make(workshop: Workshop, recordings: Recordings, source: str) -> Result:
         "source": source,
         "n_samples": workshop.n_samples,
         "sequences": {
-            key: {"trained_on": list(SEQUENCES[key].trained_on), "methods": row}
+            key: {
+                "trained_on": list(SEQUENCES[key].trained_on),
+                "methods": {name: dataclasses.asdict(f) for name, f in row.items()},
+            }
             for key, row in rows.items()
         },
     }
@@ -70,7 +76,7 @@ def make(workshop: Workshop, recordings: Recordings, source: str) -> Result:
     )
     csv: list[list[Any]] = [["sequence", "trained_on", "method", *_KEPT]]
     csv += [
-        [SEQUENCES[key].title, trained_on(key), name, *(row[name].get(k) for k in _KEPT)]
+        [SEQUENCES[key].title, trained_on(key), name, *(getattr(row[name], k) for k in _KEPT)]
         for key, row in rows.items()
         for name in _METHODS
     ]
@@ -79,9 +85,7 @@ def make(workshop: Workshop, recordings: Recordings, source: str) -> Result:
     )
 
 
-def _row(
-    workshop: Workshop, found: dict[str, Dataset], recordings: Recordings, key: str
-) -> dict[str, dict[str, Any]]:
+def _row(workshop: Workshop, found: dict[str, Dataset], recordings: Recordings, key: str) -> Row:
     """Return the figures of every method on one sequence."""
     models, training = trained(workshop, found, key)
     examples = load_examples([found[key]], names_of(found[key]))
@@ -116,28 +120,28 @@ def _censi(dataset: Dataset, recordings: Sequence[Recording]) -> Array:
     return np.array(covariances)
 
 
-def _table(rows: dict[str, dict[str, Any]]) -> list[list[str]]:
+def _table(rows: dict[str, Row]) -> list[list[str]]:
     """Return the mean divergences."""
     heads = ("baseline", "to the letter", "regularised", "relative", "Censi")
     table = [["sequence", "trained on", "pairs", *heads]]
     for key, row in rows.items():
-        n_pairs = str(row["baseline"]["n_pairs"])
-        cells = [f"{row[name]['kl_mean']:.3g}" for name in _METHODS]
+        n_pairs = str(row["baseline"].n_pairs)
+        cells = [f"{row[name].kl_mean:.3g}" for name in _METHODS]
         table.append([SEQUENCES[key].title, trained_on(key), n_pairs, *cells])
     return table
 
 
-def _ratios(rows: dict[str, dict[str, Any]]) -> list[list[str]]:
+def _ratios(rows: dict[str, Row]) -> list[list[str]]:
     """Return the ratios to the baseline, beside the paper's."""
     table = [["sequence", "to the letter", "regularised", "in the paper", "relative"]]
     names = ("letter", "paper", "relative")
     for key, row in rows.items():
-        ours = [f"{row[n]['kl_ratio']:.2f} ({row[n]['kl_median_ratio']:.2f})" for n in names]
+        ours = [f"{row[n].kl_ratio:.2f} ({row[n].kl_median_ratio:.2f})" for n in names]
         theirs = f"{_paper_ratio(key):.2f}"
         table.append([SEQUENCES[key].title, ours[0], ours[1], theirs, f"**{ours[2]}**"])
     means = [
-        f"{np.mean([r[n]['kl_ratio'] for r in rows.values()]):.2f} "
-        f"({np.mean([r[n]['kl_median_ratio'] for r in rows.values()]):.2f})"
+        f"{np.mean([r[n].kl_ratio for r in rows.values()]):.2f} "
+        f"({np.mean([r[n].kl_median_ratio for r in rows.values()]):.2f})"
         for n in names
     ]
     theirs = f"{np.mean([_paper_ratio(key) for key in rows]):.2f}"
@@ -148,30 +152,28 @@ def _paper_ratio(key: str) -> float:
     return SEQUENCES[key].kl_ours / SEQUENCES[key].kl_baseline
 
 
-def _figure(rows: dict[str, dict[str, Any]]) -> Any:
+def _figure(rows: dict[str, Row]) -> Any:
     figure = drawing.figure(9.0, 4.5)
     axes = figure.add_subplot()
     x = np.arange(len(rows))
     axes.axhline(1.0, color="black", linewidth=1, linestyle="--", label="mean baseline")
-    for k, (label, ratios, color, marker) in enumerate(
+    ratios = {n: [row[n].kl_ratio for row in rows.values()] for n in _METHODS}
+    marks: tuple[tuple[list[Any], dict[str, str]], ...] = (
+        (ratios["letter"], {"label": "to the letter", "marker": "v", "color": "ORANGE"}),
+        (ratios["paper"], {"label": "regularised", "marker": "o", "color": "BLUE"}),
         (
-            ("to the letter", [r["letter"]["kl_ratio"] for r in rows.values()], "ORANGE", "v"),
-            ("regularised", [r["paper"]["kl_ratio"] for r in rows.values()], "BLUE", "o"),
-            ("the paper, its data", [_paper_ratio(key) for key in rows], "GREY", "s"),
-            ("relative", [r["relative"]["kl_ratio"] for r in rows.values()], "GREEN", "D"),
-        )
-    ):
+            [_paper_ratio(key) for key in rows],
+            {"label": "the paper, its data", "marker": "s", "color": "GREY"},
+        ),
+        (ratios["relative"], {"label": "relative", "marker": "D", "color": "GREEN"}),
+    )
+    for k, (values, style) in enumerate(marks):
         at = x + 0.17 * (k - 1.5)
-        axes.plot(at, ratios, marker, color=getattr(drawing, color), label=label, markersize=7)
-        for place, ratio in zip(at, ratios, strict=True):
-            axes.annotate(
-                f"{ratio:.2f}",
-                (place, ratio),
-                textcoords="offset points",
-                xytext=(0, 6),
-                ha="center",
-                fontsize=7,
-            )
+        style["color"] = getattr(drawing, style["color"])
+        axes.plot(at, values, linestyle="none", markersize=7, **style)
+        over = {"textcoords": "offset points", "xytext": (0, 6), "ha": "center", "fontsize": 7}
+        for place, ratio in zip(at, values, strict=True):
+            axes.annotate(f"{ratio:.2f}", (place, ratio), **over)
     axes.set_yscale("log")
     ticks = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10]
     axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.evaluation.online import prepared
+from cello3d_ros.evaluation.result import Trajectory
 from cello3d_ros.evaluation.trajectories import Runs, consistency, length_m, odometry_runs
 from cello3d_ros.reproduction import drawing
 from cello3d_ros.reproduction.datasets import Recordings, Workshop
 from cello3d_ros.reproduction.models import datasets, testable, trained
 from cello3d_ros.reproduction.result import Result, markdown_table
 from cello3d_ros.reproduction.sequences import SEQUENCES
+
+Row = dict[str, Trajectory]  # by model
 
 IDEAL_6DOF, IDEAL_3DOF = 2.35, 1.60  # means of chi with 6 and 3 degrees of freedom
 
@@ -40,7 +44,10 @@ def make(
         "source": source,
         "n_samples": workshop.n_samples,
         "ideal": {"dm_6dof": IDEAL_6DOF, "dm_3dof": IDEAL_3DOF},
-        "sequences": rows,
+        "sequences": {
+            key: {name: dataclasses.asdict(found) for name, found in row.items()}
+            for key, row in rows.items()
+        },
     }
     text = (
         f"Mean Mahalanobis distance D_M of the final pose of {n_runs} runs of ICP odometry "
@@ -58,7 +65,7 @@ def make(
     )
     csv: list[list[Any]] = [["sequence", "model", *measures]]
     csv += [
-        [SEQUENCES[key].title, name, *(report.get(k) for k in measures)]
+        [SEQUENCES[key].title, name, *(getattr(report, k) for k in measures)]
         for key, row in rows.items()
         for name, report in row.items()
     ]
@@ -66,7 +73,7 @@ def make(
     return Result("table2", title, text, data, csv, _figure(rows))
 
 
-def _sequence(workshop: Workshop, recordings: Any, model: Any, n_runs: int) -> dict[str, Any]:
+def _sequence(workshop: Workshop, recordings: Any, model: Any, n_runs: int) -> Trajectory:
     """Return length and consistency over the recordings of one sequence."""
     lengths, all_runs = [], []
     for k, recording in enumerate(recordings):
@@ -87,10 +94,10 @@ def _sequence(workshop: Workshop, recordings: Any, model: Any, n_runs: int) -> d
         np.concatenate([r.told for r in all_runs]),
         sum(r.n_failed for r in all_runs),
     )
-    return {"length_m": float(np.mean(lengths)), **consistency(runs)}
+    return Trajectory(length_m=float(np.mean(lengths)), **vars(consistency(runs)))
 
 
-def _table(rows: dict[str, dict[str, Any]], name: str) -> list[list[str]]:
+def _table(rows: dict[str, Row], name: str) -> list[list[str]]:
     """Return our row of each sequence and the paper's after it."""
     table = [
         [
@@ -100,13 +107,13 @@ def _table(rows: dict[str, dict[str, Any]], name: str) -> list[list[str]]:
     ]
     for key, row in rows.items():
         r, theirs = row[name], SEQUENCES[key].trajectory
-        cells = [f"{r['length_m']:.1f}", f"{r['n_lost']} of {r['n_runs']}"]
-        if r["n_runs"]:
+        cells = [f"{r.length_m:.1f}", f"{r.n_lost} of {r.n_runs}"]
+        if r.n_runs:
             cells += [
-                *(f"{r['error_m']:.3g}", f"{r['dm_translation']:.2f}", f"{r['error_rad']:.2g}"),
-                *(f"{r['dm_rotation']:.2f}", f"**{r['dm_6dof']:.2f}**"),
-                f"{r['coverage_95']:.2f}",
-                f"{r['without_lost']['dm_6dof']:.2f}" if r["without_lost"] else "",
+                *(f"{r.error_m:.3g}", f"{r.dm_translation:.2f}", f"{r.error_rad:.2g}"),
+                *(f"{r.dm_rotation:.2f}", f"**{r.dm_6dof:.2f}**"),
+                f"{r.coverage_95:.2f}",
+                f"{r.without_lost.dm_6dof:.2f}" if r.n_lost < r.n_runs else "",
             ]
         table.append([SEQUENCES[key].title, *cells, *[""] * (9 - len(cells))])
         table.append(
@@ -121,28 +128,22 @@ def _table(rows: dict[str, dict[str, Any]], name: str) -> list[list[str]]:
     return [*table, ["ideal", "", "", "", *ideal]]
 
 
-def _figure(rows: dict[str, dict[str, Any]]) -> Any:
+def _figure(rows: dict[str, Row]) -> Any:
     figure = drawing.figure(9.0, 4.5)
     axes = figure.add_subplot()
     x = np.arange(len(rows))
     axes.axhspan(1.5, 3.0, color="#d9ead3", label="neither optimistic nor pessimistic (paper)")
     axes.axhline(IDEAL_6DOF, color="black", linestyle="--", linewidth=1, label="ideal, 2.35")
-    for k, (label, values, color, marker) in enumerate(
-        (
-            (
-                "paper's model here",
-                [r["paper"].get("dm_6dof") for r in rows.values()],
-                "BLUE",
-                "o",
-            ),
-            ("paper, its own data", [SEQUENCES[k].trajectory.dm_6dof for k in rows], "GREY", "s"),
-            ("relative", [r["relative"].get("dm_6dof") for r in rows.values()], "GREEN", "D"),
-        )
+    theirs = [SEQUENCES[key].trajectory.dm_6dof for key in rows]
+    by_name = {n: [row[n].dm_6dof for row in rows.values()] for n in ("paper", "relative")}
+    for offset, values, style in (
+        (-0.15, by_name["paper"], {"label": "paper's model here", "marker": "o", "color": "BLUE"}),
+        (0.0, theirs, {"label": "paper, its own data", "marker": "s", "color": "GREY"}),
+        (0.15, by_name["relative"], {"label": "relative", "marker": "D", "color": "GREEN"}),
     ):
-        known = [(a, v) for a, v in zip(x + 0.15 * (k - 1), values, strict=True) if v is not None]
-        axes.plot(
-            *np.transpose(known), marker, color=getattr(drawing, color), label=label, markersize=7
-        )
+        known = [(a, v) for a, v in zip(x + offset, values, strict=True) if v is not None]
+        style["color"] = getattr(drawing, style["color"])
+        axes.plot(*np.transpose(known), linestyle="none", markersize=7, **style)
     axes.set_xticks(x, [SEQUENCES[key].title.replace(" ", "\n") for key in rows])
     axes.set_ylabel("mean D_M of the final pose, 6 dof")
     axes.set_yscale("log")

@@ -115,9 +115,11 @@ def test_figures_are_written_and_printed(folder: Path, capsys: pytest.CaptureFix
     assert report["methods"]["sandwich_scaled"]["scale"] == pytest.approx(4.0)
     assert report["trajectories"] == {}
     assert [pair["i"] for pair in report["pairs"]] == [0, 1]
-    assert "with_flagged_pairs" not in report
+    assert report["with_flagged_pairs"] is None
     printed = capsys.readouterr().out
     assert "walk (2 pairs)" in printed
+    assert "too small: multiply by 4" in printed  # the sandwich
+    assert "the model's covariances are about right (D2/6 1); " in printed
     assert "constant" in printed
     assert sorted(path.name for path in folder.iterdir()) == ["e.json", "model.npz", "set"]
 

@@ -87,7 +87,7 @@ def test_a_model_with_its_provenance_and_a_table_come_out(
     printed = capsys.readouterr().out
     assert "15 pairs of 3 recordings" in printed
     assert "validation (10 pairs)" in printed
-    for row in ("model", "mean covariance", "constant"):
+    for row in ("cello3d", "mean covariance", "constant"):
         assert f"\n  {row} " in printed
     figures = model.provenance["figures"]["validation"]["model"]
     assert f"{figures['kl_mean']:.4g}" in printed

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cello3d_ros.config import CloudConfig, Pipeline, TrainingConfig
+from cello3d_ros.covariance.case import MethodSettings
 from cello3d_ros.covariance.features import FEATURES
-from cello3d_ros.covariance.methods import MethodSettings
 from cello3d_ros.covariance.model import Model, constant_model
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.evaluation.comparison import (
@@ -23,7 +23,7 @@ from cello3d_ros.evaluation.online import Answer
 from cello3d_ros.geometry.gaussian import kl
 from cello3d_ros.learning.dataset import PairRecord, open_dataset
 from cello3d_ros.learning.examples import Examples, load_examples
-from cello3d_ros.learning.measures import best_scale, figures, measure, pose_check, select
+from cello3d_ros.learning.measures import Figures, best_scale, figures, pose_check, select
 from cello3d_ros.learning.training import train
 
 SIZES = np.array([0.01, 0.02, 0.03, 1e-3, 2e-3, 3e-3])
@@ -47,17 +47,17 @@ def some(n: int = 8, n_samples: int = 400, seed: int = 0) -> Examples:
 def test_a_right_covariance_has_ideal_figures():
     targets = some()
     report = figures(targets.covariances, targets, targets.covariances * 2.0)
-    assert report["n_pairs"] == 8
-    assert report["kl_mean"] == pytest.approx(0.0, abs=1e-12)
-    assert report["kl_ratio"] == pytest.approx(0.0, abs=1e-12)
-    assert report["dm2_over_6"] == pytest.approx(1.0)
-    assert report["coverage_95"] == pytest.approx(0.95, abs=0.01)
-    assert report["coverage"][4] == pytest.approx(0.5, abs=0.03)
-    assert report["coverage"] == sorted(report["coverage"])
-    assert report["direction"] == "right"
+    assert report.n_pairs == 8
+    assert report.kl_mean == pytest.approx(0.0, abs=1e-12)
+    assert report.kl_ratio == pytest.approx(0.0, abs=1e-12)
+    assert report.dm2_over_6 == pytest.approx(1.0)
+    assert report.coverage_95 == pytest.approx(0.95, abs=0.01)
+    assert report.coverage[4] == pytest.approx(0.5, abs=0.03)
+    assert report.coverage == sorted(report.coverage)
+    assert report.verdict == "about right"
     for part in ("translation", "rotation"):
-        assert report[part]["dm2_over_3"] == pytest.approx(1.0)
-        assert report[part]["coverage_95"] == pytest.approx(0.95, abs=0.015)
+        assert getattr(report, part).dm2_over_3 == pytest.approx(1.0)
+        assert getattr(report, part).coverage_95 == pytest.approx(0.95, abs=0.015)
 
 
 @pytest.mark.parametrize(("factor", "direction"), [(2.0, "too large"), (0.5, "too small")])
@@ -65,37 +65,39 @@ def test_the_direction_of_an_error_is_said(factor, direction):
     targets = some()
     F = factor * targets.covariances
     report = figures(F, targets, targets.covariances * 10.0)
-    assert report["kl_mean"] == pytest.approx({2.0: 0.579442, 0.5: 0.920558}[factor])
-    assert report["kl_ratio"] == pytest.approx(report["kl_mean"] / 4.207755)
-    assert report["dm2_over_6"] == pytest.approx(1.0 / factor)
-    assert report["direction"] == direction
-    assert (report["coverage_95"] > 0.95) == (factor > 1)
+    assert report.kl_mean == pytest.approx({2.0: 0.579442, 0.5: 0.920558}[factor])
+    assert report.kl_ratio == pytest.approx(report.kl_mean / 4.207755)
+    assert report.dm2_over_6 == pytest.approx(1.0 / factor)
+    assert report.verdict == f"{direction}: multiply by {1.0 / factor:g}"
+    assert (report.coverage_95 > 0.95) == (factor > 1)
 
 
 def test_translation_and_rotation_are_told_apart():
     targets = some()
     scale = np.repeat([1.0, 3.0], 3)
     report = figures(targets.covariances * np.outer(scale, scale), targets)
-    assert report["translation"]["dm2_over_3"] == pytest.approx(1.0)
-    assert report["rotation"]["dm2_over_3"] == pytest.approx(1.0 / 9.0)
-    assert report["rotation"]["coverage_95"] > 0.999
-    assert "kl_ratio" not in report
+    assert report.translation.dm2_over_3 == pytest.approx(1.0)
+    assert report.rotation.dm2_over_3 == pytest.approx(1.0 / 9.0)
+    assert report.rotation.coverage_95 > 0.999
+    assert report.kl_ratio is None
 
 
-def test_figures_mean_what_training_prints():
+def test_divergences_are_summarised():
     targets = some()
     F = targets.covariances * np.linspace(0.3, 4.0, 8)[:, None, None]
-    report, printed = figures(F, targets), measure(F, targets)
-    for ours, theirs in (
-        ("n_pairs", "n_pairs"),
-        ("kl_mean", "kl_mean"),
-        ("kl_median", "kl_median"),
-        ("kl_trimmed_mean", "kl_trimmed_mean"),
-        ("dm2_over_6", "mahalanobis2_over_6"),
-        ("coverage_95", "coverage_95"),
-    ):
-        assert report[ours] == pytest.approx(printed[theirs]), ours
-    assert report["kl_90"] == pytest.approx(np.quantile(kl(targets.covariances, F), 0.9))
+    report, each = figures(F, targets), np.sort(kl(targets.covariances, F))
+    assert report.kl_mean == pytest.approx(each.mean())
+    assert report.kl_median == pytest.approx(np.median(each))
+    assert report.kl_trimmed_mean == pytest.approx(each[:7].mean())
+    assert report.kl_90 == pytest.approx(np.quantile(each, 0.9))
+    bare = figures(F, dataclasses.replace(targets, xi=()))
+    assert bare == dataclasses.replace(
+        report,
+        coverage_95=None,
+        coverage=[],
+        translation=dataclasses.replace(report.translation, coverage_95=None),
+        rotation=dataclasses.replace(report.rotation, coverage_95=None),
+    )
 
 
 def test_pairs_without_an_answer_enter_no_figure_nor_its_ratio():
@@ -104,9 +106,9 @@ def test_pairs_without_an_answer_enter_no_figure_nor_its_ratio():
     baseline[3] *= 1e3
     F[3] = np.nan
     report = figures(F, targets, baseline)
-    assert report["n_pairs"] == 7
-    assert report["kl_ratio"] == pytest.approx(0.579442 / 4.207755, rel=1e-5)
-    assert figures(np.full_like(F, np.nan), targets) == {"n_pairs": 0}
+    assert report.n_pairs == 7
+    assert report.kl_ratio == pytest.approx(0.579442 / 4.207755, rel=1e-5)
+    assert figures(np.full_like(F, np.nan), targets) == Figures(n_pairs=0)
 
 
 def test_the_best_scale_has_the_least_mean_divergence():
@@ -143,10 +145,10 @@ def cloud_of(offset_m, offset_rad, sigma_m=0.01, sigma_rad=0.002):
 )
 def test_a_pose_is_suspected_by_the_stated_rule(offset_m, offset_rad, sigma_m, flagged):
     check = pose_check(cloud_of(offset_m, offset_rad, sigma_m))
-    assert check["flagged"] is flagged
-    assert check["offset_m"] == pytest.approx(offset_m, abs=1e-12)
-    assert check["offset_rad"] == pytest.approx(offset_rad, abs=1e-12)
-    assert check["scatter_m"] == pytest.approx(sigma_m, rel=0.1)
+    assert check.flagged is flagged
+    assert check.offset_m == pytest.approx(offset_m, abs=1e-12)
+    assert check.offset_rad == pytest.approx(offset_rad, abs=1e-12)
+    assert check.scatter_m == pytest.approx(sigma_m, rel=0.1)
 
 
 def test_a_selection_keeps_everything_of_its_pairs():
@@ -164,17 +166,17 @@ def test_methods_from_a_dataset():
     targets, settings = some(), MethodSettings(sigma_m=0.1)
     model = constant_model(4.0 * np.eye(6), 3, shape="sandwich")
     found = from_dataset(model, targets, np.diag(SIZES**2), settings)
-    report = compare(found, targets, np.ones(8, np.bool_), settings)
-    methods = report["methods"]
+    report, by_recording = compare(found, targets, np.ones(8, np.bool_), settings)
+    methods = report.methods
     for name in ("cello3d", "constant", "hessian", "hessian_scaled", "sandwich_scaled"):
-        assert methods[name]["kl_mean"] == pytest.approx(0.0, abs=1e-9), name
-    assert methods["sandwich"]["dm2_over_6"] == pytest.approx(4.0)
-    assert methods["sandwich_scaled"]["scale"] == pytest.approx(4.0)
-    assert methods["mean_covariance"]["kl_ratio"] == pytest.approx(1.0)
-    assert methods["cello3d"]["ms_per_pair"] is None
-    assert set(report["recordings"]) == {"a", "b"}
-    assert report["recordings"]["a"]["n_pairs"] == 4
-    assert report["n_pairs"] == 8
+        assert methods[name].kl_mean == pytest.approx(0.0, abs=1e-9), name
+    assert methods["sandwich"].dm2_over_6 == pytest.approx(4.0)
+    assert methods["sandwich_scaled"].scale == pytest.approx(4.0)
+    assert methods["mean_covariance"].kl_ratio == pytest.approx(1.0)
+    assert methods["cello3d"].ms_per_pair is None
+    assert set(by_recording) == {"a", "b"}
+    assert by_recording["a"].n_pairs == 4
+    assert report.n_pairs == 8
 
 
 def test_a_pair_far_from_every_example_is_also_judged_as_it_is_widened():
@@ -206,10 +208,10 @@ def test_flagged_pairs_are_left_out():
     found = from_dataset(model, targets, np.eye(6), settings)
     found.covariances["cello3d"][1] *= 1e6
     keep = np.arange(8) != 1
-    report = compare(found, targets, keep, settings)
-    assert report["n_pairs"] == 7
-    assert report["recordings"]["b"]["n_pairs"] == 3
-    assert report["methods"]["cello3d"]["kl_mean"] == pytest.approx(0.0, abs=1e-9)
+    report, by_recording = compare(found, targets, keep, settings)
+    assert report.n_pairs == 7
+    assert by_recording["b"].n_pairs == 3
+    assert report.methods["cello3d"].kl_mean == pytest.approx(0.0, abs=1e-9)
 
 
 def test_answers_from_clouds_stand_beside_those_of_the_dataset():
@@ -226,16 +228,16 @@ def test_answers_from_clouds_stand_beside_those_of_the_dataset():
             {"fused": Answer(2.0 * targets.covariances[6], 10.0), "cello3d": Answer(nothing, 8.0)},
         ],
     )
-    methods = compare(found, targets, np.ones(8, np.bool_), settings)["methods"]
-    assert methods["fused"]["n_pairs"] == 2
-    assert methods["fused"]["n_failed"] == 1
-    assert methods["fused"]["ms_per_pair"] == pytest.approx(30.0)
-    assert methods["fused"]["icp_runs"] == 5
-    assert methods["fused"]["kl_mean"] == pytest.approx(0.579442, rel=1e-5)
-    assert methods["cello3d"]["n_pairs"] == 8  # from the dataset
-    assert methods["cello3d"]["n_failed"] == 0
-    assert methods["cello3d"]["ms_per_pair"] == pytest.approx(8.0)
-    assert methods["censi"]["n_pairs"] == 0
+    methods = compare(found, targets, np.ones(8, np.bool_), settings)[0].methods
+    assert methods["fused"].n_pairs == 2
+    assert methods["fused"].n_failed == 1
+    assert methods["fused"].ms_per_pair == pytest.approx(30.0)
+    assert methods["fused"].icp_runs == 5
+    assert methods["fused"].kl_mean == pytest.approx(0.579442, rel=1e-5)
+    assert methods["cello3d"].n_pairs == 8  # from the dataset
+    assert methods["cello3d"].n_failed == 0
+    assert methods["cello3d"].ms_per_pair == pytest.approx(8.0)
+    assert methods["censi"].n_pairs == 0
     assert "fused" in divergences(found, targets, 2)
     assert "fused" not in divergences(found, targets, 5)
 
@@ -254,7 +256,7 @@ def test_a_dataset_without_the_models_shape_is_refused():
         from_dataset(model, targets, np.eye(6), MethodSettings())
     settings = MethodSettings()
     absolute = from_dataset(constant_model(np.eye(6), 3), targets, np.eye(6), settings)
-    methods = compare(absolute, targets, np.ones(8, np.bool_), settings)["methods"]
+    methods = compare(absolute, targets, np.ones(8, np.bool_), settings)[0].methods
     assert set(methods) == {"mean_covariance", "cello3d", "cello3d_widened", "constant"}
 
 

@@ -11,6 +11,7 @@ from cello3d_ros.covariance.lost import Lost
 from cello3d_ros.covariance.model import constant_model
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.evaluation import trajectories as module
+from cello3d_ros.evaluation.result import Consistency, Distances
 from cello3d_ros.evaluation.trajectories import (
     Runs,
     compound_chain,
@@ -43,10 +44,12 @@ def test_a_chain_of_true_covariances_is_consistent():
         0,
     )
     report = consistency(runs)
-    assert report["dm_6dof"] == pytest.approx(2.350, abs=0.05)
-    assert report["dm_translation"] == pytest.approx(1.596, abs=0.05)
-    assert report["dm_rotation"] == pytest.approx(1.596, abs=0.05)
-    assert report["coverage_95"] == pytest.approx(0.95, abs=0.015)
+    assert report.dm_6dof == pytest.approx(2.350, abs=0.05)
+    assert report.dm_translation == pytest.approx(1.596, abs=0.05)
+    assert report.dm_rotation == pytest.approx(1.596, abs=0.05)
+    assert report.coverage_95 == pytest.approx(0.95, abs=0.015)
+    assert report.nees_over_6 == pytest.approx(1.0, abs=0.03)
+    assert report.verdict == "about right"
 
 
 def test_distances_are_those_of_the_blocks():
@@ -54,15 +57,15 @@ def test_distances_are_those_of_the_blocks():
     Y[:, 0, 3] = Y[:, 3, 0] = 3.0
     xi = np.array([[2.0, 0, 0, 3.0, 0, 0], [0, 40.0, 0, 0, 0, 0]])
     report = consistency(Runs(xi, Y, np.array([False, True]), np.array([True, True]), 3))
-    assert (report["n_runs"], report["n_failed"], report["n_lost"]) == (2, 3, 1)
-    assert (report["n_told"], report["n_lost_told"]) == (2, 1)
-    near = report["without_lost"]
-    assert near["dm_translation"] == pytest.approx(1.0)
-    assert near["dm_rotation"] == pytest.approx(1.0)
-    assert near["dm_6dof"] == pytest.approx(np.sqrt(4.0 / 3.0))  # correlation 0.5
-    assert near["coverage_95"] == 1.0
-    assert report["coverage_95"] == 0.5
-    assert report["dm_translation"] == pytest.approx(10.5)
+    assert (report.n_runs, report.n_failed, report.n_lost) == (2, 3, 1)
+    assert (report.n_told, report.n_lost_told) == (2, 1)
+    near = report.without_lost
+    assert near.dm_translation == pytest.approx(1.0)
+    assert near.dm_rotation == pytest.approx(1.0)
+    assert near.dm_6dof == pytest.approx(np.sqrt(4.0 / 3.0))  # correlation 0.5
+    assert near.coverage_95 == 1.0
+    assert report.coverage_95 == 0.5
+    assert report.dm_translation == pytest.approx(10.5)
 
 
 def test_a_chain_too_wide_for_the_fourth_order_stays_positive_definite():
@@ -75,7 +78,7 @@ def test_without_any_run_there_are_no_distances():
     none = np.zeros(0, np.bool_)
     report = consistency(Runs(np.zeros((0, 6)), np.zeros((0, 6, 6)), none, none, 4))
     counts = {"n_runs": 0, "n_failed": 4, "n_lost": 0, "n_told": 0, "n_lost_told": 0}
-    assert report == {**counts, "without_lost": {}}
+    assert report == Consistency(**counts, without_lost=Distances())
 
 
 def test_length_is_that_of_the_path():

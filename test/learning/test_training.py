@@ -177,7 +177,7 @@ def test_planted_feature_is_found_and_beats_the_mean() -> None:
     config = dataclasses.replace(PAPER, theta="upper_triangular")
     training = train(planted(seed=0), config, planted(100, seed=1))
     figures = training.figures["validation"]
-    assert figures["model"]["kl_mean"] < 0.3 * figures["mean_covariance"]["kl_mean"]
+    assert figures["cello3d"].kl_mean < 0.3 * figures["mean_covariance"].kl_mean
     weights = np.linalg.norm(training.model.theta / training.model.scale, axis=0)
     assert np.argmax(weights) == 3
     assert weights[3] > 3 * np.delete(weights, 3).max()
@@ -257,9 +257,9 @@ def test_the_model_predicts_as_training_judged_it(form: str, shape: str) -> None
         ]
     )
     divergence = kl(validation.covariances, F)
-    figures = training.figures["validation"]["model"]
-    assert figures["kl_mean"] == pytest.approx(divergence.mean(), rel=1e-9)
-    assert figures["kl_median"] == pytest.approx(np.median(divergence), rel=1e-9)
+    figures = training.figures["validation"]["cello3d"]
+    assert figures.kl_mean == pytest.approx(divergence.mean(), rel=1e-9)
+    assert figures.kl_median == pytest.approx(np.median(divergence), rel=1e-9)
     assert is_positive_definite(F).all()
 
 
@@ -387,8 +387,8 @@ def test_an_interrupt_keeps_the_best_so_far() -> None:
     assert training.interrupted
     assert not whole.interrupted
     assert training.n_iterations == 2 < whole.n_iterations
-    kl_of = [t.figures["validation"]["model"]["kl_mean"] for t in (whole, training)]
-    assert kl_of[0] < kl_of[1] < training.figures["validation"]["mean_covariance"]["kl_mean"]
+    kl_of = [t.figures["validation"]["cello3d"].kl_mean for t in (whole, training)]
+    assert kl_of[0] < kl_of[1] < training.figures["validation"]["mean_covariance"].kl_mean
 
 
 def test_the_best_theta_by_validation_is_kept() -> None:
@@ -403,7 +403,7 @@ def test_the_best_theta_by_validation_is_kept() -> None:
     assert training.n_iterations == seen[-1][1] <= training.best_iteration + 20
     assert training.best_iteration in (best[1], 0)
     figures = training.figures["validation"]
-    assert figures["model"]["kl_mean"] <= figures["mean_covariance"]["kl_mean"] * (1 + 1e-9)
+    assert figures["cello3d"].kl_mean <= figures["mean_covariance"].kl_mean * (1 + 1e-9)
 
 
 def test_figures_say_both_how_far_and_in_which_direction() -> None:
@@ -415,20 +415,20 @@ def test_figures_say_both_how_far_and_in_which_direction() -> None:
         xi=tuple(rng.multivariate_normal(np.zeros(6), 4 * Y, size=50) for _ in range(60)),
     )
     figures = train(examples, PAPER).figures["leave_recording_out"]
-    assert set(figures) == {"model", "mean_covariance", "constant"}
+    assert set(figures) == {"cello3d", "mean_covariance", "constant"}
     # all pairs have the same covariance, and the sampled errors are twice as large
-    assert figures["model"]["kl_mean"] == pytest.approx(0.0, abs=1e-9)
-    assert figures["model"]["mahalanobis2_over_6"] == pytest.approx(1.0)
+    assert figures["cello3d"].kl_mean == pytest.approx(0.0, abs=1e-9)
+    assert figures["cello3d"].dm2_over_6 == pytest.approx(1.0)
     inside = np.mean(rng.chisquare(6, 100000) < 12.5916 / 4)
-    assert figures["model"]["coverage_95"] == pytest.approx(inside, abs=0.03)
+    assert figures["cello3d"].coverage_95 == pytest.approx(inside, abs=0.03)
     smaller = dataclasses.replace(examples, covariances=np.tile(Y, (60, 1, 1)))
     smaller.covariances[examples.groups == "world_s0"] /= 10
     figures = train(smaller, PAPER).figures["leave_recording_out"]
-    assert figures["mean_covariance"]["mahalanobis2_over_6"] == pytest.approx((0.1 + 2 / 0.55) / 3)
+    assert figures["mean_covariance"].dm2_over_6 == pytest.approx((0.1 + 2 / 0.55) / 3)
     wide, narrow = (float(kl(np.eye(6), size * np.eye(6))) for size in (0.55, 10.0))
-    assert figures["mean_covariance"]["kl_mean"] == pytest.approx((2 * wide + narrow) / 3)
-    assert figures["mean_covariance"]["kl_median"] == pytest.approx(wide)
-    assert figures["mean_covariance"]["kl_trimmed_mean"] == pytest.approx(
+    assert figures["mean_covariance"].kl_mean == pytest.approx((2 * wide + narrow) / 3)
+    assert figures["mean_covariance"].kl_median == pytest.approx(wide)
+    assert figures["mean_covariance"].kl_trimmed_mean == pytest.approx(
         (40 * wide + 14 * narrow) / 54
     )
     assert figures["constant"] == figures["mean_covariance"]  # the shape is none
@@ -620,6 +620,6 @@ def test_the_margin_is_in_the_figures_too() -> None:
         train(planted(60), dataclasses.replace(PAPER, margin=margin, max_iterations=3))
         for margin in (1.0, 2.0)
     )
-    a, b = (t.figures["leave_recording_out"]["model"] for t in (one, wide))
-    assert b["mahalanobis2_over_6"] == pytest.approx(a["mahalanobis2_over_6"] / 2.0)
+    a, b = (t.figures["leave_recording_out"]["cello3d"] for t in (one, wide))
+    assert b.dm2_over_6 == pytest.approx(a.dm2_over_6 / 2.0)
     assert wide.model.margin == 2.0

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from cello3d_ros.cli.main import main
-from cello3d_ros.evaluation.evidence import PROBABILITIES
+from cello3d_ros.evaluation.comparison import PROBABILITIES
 from cello3d_ros.geometry.se3 import exp
 
 NASTY = '<img src=x onerror="alert(1)"></script>&'
@@ -29,7 +29,7 @@ def figures(kl: float) -> dict[str, Any]:
         "kl_ratio": 0.5,
         "dm2_over_6": 1.1,
         "coverage_95": 0.93,
-        "direction": "right",
+        "verdict": "about right",
         "ms_per_pair": None,
         "icp_runs": 0,
     }
@@ -43,18 +43,27 @@ def an_evaluation(name: str = "walk") -> dict[str, Any]:
     methods = {"cello3d": figures(1.25), "mean_covariance": figures(7.5)}
     truth = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0.5, 0]])
     pairs = [
-        {"recording": name, "i": i, "j": i + 1, "kl": {"cello3d": 1.0 + i, "mean_covariance": 7.5}}
+        {
+            **{"recording": name, "i": i, "j": i + 1, "flagged": False},
+            **{"offset_m": 0.0, "scatter_m": 0.01, "offset_rad": 0.0, "scatter_rad": 0.01},
+            "kl": {"cello3d": 1.0 + i, "mean_covariance": 7.5},
+            "dm2_over_6": {"cello3d": 2.2, "mean_covariance": 0.3},
+        }
         for i in range(2)
     ]
     shown = {
         **{"recording": name, "j": 1, "i": 0, "kl": 2.0, "T_mean": exp([0.3, 0, 0, 0, 0, 0.1])},
         **{"covariance": Y, "predicted": 4.0 * Y, "xi": xi, "kept": [1] * 50 + [0] * 10},
+        **{"dm2_over_6": 2.2, "flagged": True},
     }
     path = {
         **{"truth": truth, "positions": [truth[1:] + 0.01, truth[1:] - 0.01]},
         "covariances": np.tile(1e-4 * np.eye(3), (2, 2, 1, 1)),
     }
+    counts = {"n_runs": 2, "n_failed": 0, "n_lost": 0, "n_told": 0, "n_lost_told": 0}
+    walked = {"length_m": 2.1, **counts, "dm_6dof": 2.2, "without_lost": {}, "paths": path}
     report = {
+        **{"settings": {}, "pose_check": {}, "with_flagged_pairs": None},
         **{"model": f"{name}.npz", "shape": "sandwich", "n_pairs": 2, "methods": methods},
         "recordings": {name: {"n_pairs": 2, "methods": methods}},
         "pairs": pairs,
@@ -63,7 +72,7 @@ def an_evaluation(name: str = "walk") -> dict[str, Any]:
             "dm2": {"cello3d": list(np.linspace(0.5, 20.0, len(PROBABILITIES)))},
         },
         "worst_pairs": [shown],
-        "trajectories": {name: {"length_m": 2.1, "n_runs": 2, "dm_6dof": 2.2, "paths": path}},
+        "trajectories": {name: walked},
     }
     return json.loads(json.dumps(report, default=np.ndarray.tolist))
 
@@ -113,7 +122,9 @@ def test_the_page_holds_the_figures_and_fetches_nothing(tmp_path: Path) -> None:
     page = (tmp_path / "r.html").read_text()
     assert "<td>1.25</td>" in page
     assert "<td>7.5</td>" in page
-    assert "walk 0–1, KL 2" in page
+    assert "walk 0–1, KL 2, covariance too small: multiply by 2.2, its pose is suspected" in page
+    assert "<dt>cello3d</dt><dd>the prediction of the model" in page
+    assert "<dt>censi</dt>" not in page
     ours = re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
     assert "http" not in ours.replace("http-equiv", "")
     assert "src=" not in ours
@@ -145,13 +156,22 @@ def test_clouds_are_shown_thinned_where_they_are_given(tmp_path: Path, walk: Pat
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda r: r.pop("calibration"), "of an earlier version: it lacks 'calibration'"),
+        (lambda r: r.pop("calibration"), "of another version: the evaluation lacks 'calibration'"),
         (lambda r: r.pop("methods"), "no JSON of cello3d evaluate: it has no 'methods'"),
-        (lambda r: r.update(pairs={}), "damaged: 'pairs' is not a list"),
-        (lambda r: r["pairs"][0].pop("kl"), "damaged: lacks 'kl'"),
-        (lambda r: r["methods"]["cello3d"].update(kl_mean="much"), "damaged: could not convert"),
-        (lambda r: r["worst_pairs"][0].update(xi=[[1, 2]]), "damaged: cannot reshape"),
-        (lambda r: r["trajectories"]["walk"].update(paths=[]), "damaged: list indices"),
+        (lambda r: r.update(pairs={}), "damaged: 'pairs' of the evaluation is not of type list"),
+        (lambda r: r["pairs"][0].pop("kl"), "an entry of 'pairs' of the evaluation lacks 'kl'"),
+        (
+            lambda r: r["methods"]["cello3d"].update(kl_mean="much"),
+            "'kl_mean' of 'cello3d' of 'methods' of the evaluation is not of type float",
+        ),
+        (
+            lambda r: r["worst_pairs"][0].update(xi=[[1, 2]]),
+            "damaged: 'xi' has shape (1, 2), not (60, 6)",
+        ),
+        (
+            lambda r: r["trajectories"]["walk"].update(paths=[]),
+            "damaged: 'paths' of 'walk' of 'trajectories' of the evaluation is not an",
+        ),
     ],
 )
 def test_a_damaged_or_older_file_is_said_in_one_sentence(
@@ -224,6 +244,11 @@ def test_a_browser_draws_the_page(browser: Any, scheme: str, tmp_path: Path, wal
         shown = tab.locator(f"#{name}")
         assert n_colors(shown.screenshot()) > 50
         assert shown.locator("canvas").count() > 0
+    for name in ("calibration", "divergence", "path0", "samples", "clouds"):
+        tab.locator(f"#{name}").hover()
+        legend = tab.locator(f"#{name} .legend").bounding_box()
+        bar = tab.locator(f"#{name} .modebar-group").first.bounding_box()
+        assert legend["x"] + legend["width"] <= bar["x"], name  # the tool bar hides no name
     before = tab.locator("#clouds").screenshot()
     box = tab.locator("#clouds").bounding_box()
     tab.mouse.move(box["x"] + 200, box["y"] + 250)

@@ -10,11 +10,12 @@ function themed(layout) {
   const axis = {gridcolor: grid, zerolinecolor: grid, linecolor: grid};
   const all = {
     ...layout, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
-    font: {color: text, size: 12}, margin: {l: 60, r: 10, t: 10, b: 50},
+    font: {color: text, size: 12}, margin: {l: 60, r: 44, t: 10, b: 50},
+    modebar: {orientation: "v"},  // in the right margin, clear of the legend
     legend: {orientation: "h", y: 1.02, yanchor: "bottom", itemsizing: "constant"}
   };
   if (layout.scene) {
-    all.margin = {l: 0, r: 0, t: 10, b: 0};
+    all.margin = {l: 0, r: 44, t: 10, b: 0};
     all.scene = {...layout.scene};
     for (const name of ["xaxis", "yaxis", "zaxis"]) {
       all.scene[name] = {...layout.scene[name], ...axis, showbackground: false};
