@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from contextlib import ExitStack, contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,9 @@ from cello3d_ros.learning.pairs import pairs
 from cello3d_ros.learning.sampling import sample_recording
 from cello3d_ros.recordings import open_recording
 
-pytest.importorskip("distributed")
+pytestmark = pytest.mark.skipif(
+    find_spec("distributed") is None, reason="distributed is not installed: extra 'cluster'"
+)
 
 SAMPLING = SamplingConfig(n_samples=60, variance=0.01, max_gap=2, n_rotations=2)
 PIPELINE = pipeline_of(load_config(Path(__file__).parents[2] / "config" / "cello3d.yaml"))

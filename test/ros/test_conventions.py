@@ -6,9 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-
-pytest.importorskip("rclpy")
-
 from scipy.spatial.transform import Rotation
 
 from cello3d_ros.geometry import se3

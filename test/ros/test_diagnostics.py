@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy")
-
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.covariance.estimator import Estimate
 from cello3d_ros.errors import (

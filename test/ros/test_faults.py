@@ -5,22 +5,16 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
-import pytest
-
-pytest.importorskip("rclpy")
-
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
+from robot import STEP_NS, Robot
 
 from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.ros import messages
 from cello3d_ros.ros.process import NodeProcess
 from cello3d_ros.ros.replay import Player
-
-from .conftest import STEP_NS, Robot
 
 S = 10**9
 
@@ -104,7 +98,7 @@ def test_the_newest_cloud_is_next_when_many_came_during_long_work(robot, change)
 PUBLISHER = """
 import sys
 from cello3d_ros.ros.replay import Player
-from conftest import Robot
+from robot import Robot
 robot = Robot(Player(int(sys.argv[1])))
 robot.stamp_ns = int(sys.argv[2])
 robot.player.connect(robot.stamp_ns, robot.pose(), 180.0)
@@ -118,7 +112,7 @@ def test_a_publisher_that_is_killed_and_comes_back(robot, node, domain_id) -> No
     for _ in range(2):
         robot.step(S)
         command = [sys.executable, "-c", PUBLISHER, str(domain_id), str(robot.stamp_ns)]
-        path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+        path = os.pathsep.join(sys.path)
         other = subprocess.Popen(
             command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path}
         )

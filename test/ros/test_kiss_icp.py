@@ -8,12 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy")
-pytest.importorskip("kiss_icp")
-
-from kiss_icp.config import load_config
-from kiss_icp.kiss_icp import KissICP
-
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import mahalanobis
 from cello3d_ros.recordings import open_recording
@@ -35,6 +29,10 @@ class InMemory(list):
 @pytest.fixture(scope="module")
 def scans() -> InMemory:
     """Ten scans of a street, with KISS-ICP's poses where odometry would be."""
+    pytest.importorskip("kiss_icp")
+    from kiss_icp.config import load_config
+    from kiss_icp.kiss_icp import KissICP
+
     config = load_config(None)
     config.data.deskew = False
     odometry, scans = KissICP(config), InMemory()

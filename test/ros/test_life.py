@@ -4,9 +4,6 @@ import shutil
 from collections.abc import Iterator
 
 import pytest
-
-pytest.importorskip("rclpy")
-
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from std_srvs.srv import Trigger

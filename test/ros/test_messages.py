@@ -2,9 +2,6 @@
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy")
-
 from scipy.spatial.transform import Rotation
 
 from cello3d_ros.errors import CovarianceError

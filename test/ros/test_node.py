@@ -5,8 +5,6 @@ import itertools
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy")
-
 from cello3d_ros.geometry import se3
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.ros import messages, replay

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy")
-
 from cello3d_ros.geometry import se3
 from cello3d_ros.ros import messages
 

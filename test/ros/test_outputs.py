@@ -2,9 +2,6 @@
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy")
-
 from consumer_rules import of_pose, of_twist
 
 from cello3d_ros.config import NodeConfig

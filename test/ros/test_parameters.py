@@ -2,9 +2,6 @@
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy")
-
 from rcl_interfaces.srv import DescribeParameters
 
 

@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy")
-
 from cello3d_ros.config import Config
 from cello3d_ros.covariance.model import constant_model
 from cello3d_ros.ros import messages

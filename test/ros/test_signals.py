@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("rclpy")
-
 from cello3d_ros.ros.process import NodeProcess
 
 NUMBERS = [signal.SIGINT, signal.SIGTERM]

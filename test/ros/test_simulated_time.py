@@ -4,9 +4,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy")
-
 from rosgraph_msgs.msg import Clock
 
 from cello3d_ros.ros import messages, replay

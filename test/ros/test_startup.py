@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy")
-
 from cello3d_ros.config import Config, load_config
 from cello3d_ros.geometry import se3
 from cello3d_ros.ros import parameter_file

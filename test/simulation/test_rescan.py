@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from cello3d_ros.simulation.rescan import rescannable
 from cello3d_ros.simulation.scanner import SCANNERS, Echoes, measure
 from cello3d_ros.simulation.simulation import Simulation
 
-pytest.importorskip("open3d")
+pytestmark = pytest.mark.skipif(find_spec("open3d") is None, reason="Open3D is not installed")
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import yaml
 from cello3d_ros.config import Config, NodeConfig, config_from
 from cello3d_ros.ros.process import PROFILE, shared_file
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 LAUNCH = ROOT / "launch"
 EXAMPLES = sorted(ROOT.glob("config/examples/*.yaml"))
 OURS = "/covariance_node/"

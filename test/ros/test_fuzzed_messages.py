@@ -10,17 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy")
-
 from lifecycle_msgs.srv import GetState
 from rclpy.serialization import serialize_message
+from robot import Robot
 
 from cello3d_ros.geometry import se3
 from cello3d_ros.recordings import open_recording
 from cello3d_ros.ros import messages
-
-from .conftest import Robot
 
 N_DAMAGED, N_BATCH = 5000, 100
 N_GOOD = 4  # one more than the failures after which a reference is given up

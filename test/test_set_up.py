@@ -1,0 +1,68 @@
+"""The suite is collected wherever ROS, its pytest plugins and the optional libraries are or not."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+OPTIONAL = ("rclpy", "open3d", "distributed", "kiss_icp", "small_gicp", "plotly", "playwright")
+
+# As ROS's launch_testing does, look into each module before pytest collects it, and forgive
+# nothing but a syntax error. A module that skips itself while it is imported ends the collection.
+PLUGIN = """
+import inspect, os, sys
+from pathlib import Path
+import pytest
+from _pytest.pathlib import import_path
+
+def pytest_configure():
+    for library in os.environ["HIDDEN_LIBRARIES"].split():
+        sys.modules[library] = None
+
+def pytest_pycollect_makemodule({argument}, parent):
+    known = inspect.signature(import_path).parameters
+    words = {{"root": parent.config.rootpath}}
+    if "consider_namespace_packages" in known:
+        words["consider_namespace_packages"] = False
+    module = import_path(Path({argument}), **words)
+    assert not hasattr(module, "generate_test_description")
+    return pytest.Module.from_parent(parent, path=Path({argument}))
+"""
+
+
+def collected(folder: Path, *arguments: str, hidden: str = "") -> str:
+    """Return what pytest prints when it collects the suite with plugins from a folder."""
+    path = os.pathsep.join([str(folder), str(ROOT), *sys.path])
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider"]
+        + [*arguments],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": path, "HIDDEN_LIBRARIES": hidden},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stdout[-3000:] + run.stderr[-3000:]
+    return run.stdout
+
+
+@pytest.mark.parametrize("name", ["launch_testing", "launch_ros"])
+def test_plugins_of_ros_that_this_pytest_refuses_are_left_out(tmp_path: Path, name: str) -> None:
+    """Pytest 9 knows no argument ``path``: with such a plugin it does not start."""
+    (tmp_path / "stub_plugin.py").write_text(PLUGIN.format(argument="path"))
+    info = tmp_path / "stub_plugin-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stub_plugin\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[pytest11]\n{name} = stub_plugin\n")
+    assert "test_se3" in collected(tmp_path, "test/geometry/test_se3.py")
+
+
+@pytest.mark.parametrize("hidden", ["", " ".join(OPTIONAL)], ids=["all there", "none there"])
+def test_a_plugin_that_imports_each_module_collects_the_suite(tmp_path: Path, hidden: str) -> None:
+    (tmp_path / "stub_plugin.py").write_text(PLUGIN.format(argument="module_path"))
+    said = collected(tmp_path, "-p", "stub_plugin", hidden=hidden)
+    assert "test/learning/test_cluster.py::" in said
+    assert "test/simulation/test_rescan.py::" in said
+    assert ("rclpy is not installed" in said) == bool(hidden)
