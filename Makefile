@@ -33,11 +33,14 @@ clean:
 
 # The ROS that is sourced is used when there is one, ROS 2 wheels from PyPI otherwise.
 $(VENV)/.ready: setup.py
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; v < (3, 11) and sys.exit( \
+	  "cello3d_ros needs Python 3.11 or newer; $(PYTHON) is Python %d.%d: make PYTHON=python3.12" % v)'
+	@echo "Setting up $(VENV): about a minute, 1.8 GB."
 	set -e; \
 	if $(PYTHON) -c "import rclpy" 2>/dev/null; then \
 	  $(PYTHON) -m venv --system-site-packages $(VENV); extras="open3d,dev"; \
 	else \
 	  $(PYTHON) -m venv $(VENV); extras="ros,open3d,dev"; \
 	fi; \
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$$extras]"
+	$(BIN)/python -m pip install --disable-pip-version-check --editable ".[$$extras]"
 	touch $@

@@ -1,6 +1,10 @@
+import sys
 from glob import glob
 
 from setuptools import find_packages, setup
+
+if sys.version_info < (3, 11):  # noqa: UP036 - before pip searches for old requirements
+    sys.exit("cello3d_ros needs Python 3.11 or newer, not {}.{}".format(*sys.version_info))
 
 NAME = "cello3d_ros"
 
@@ -9,6 +13,7 @@ OPEN3D = [
     "open3d-cpu>=0.19; platform_machine == 'x86_64'",
     "open3d>=0.19; platform_machine != 'x86_64'",
 ]
+CSV = ["pyarrow>=15"]  # reads clouds and poses in CSV files; has no rosdep key
 CLUSTER = ["distributed>=2024.1"]
 SMALL_GICP = ["small_gicp>=1.0"]
 REPORT = ["plotly>=6"]  # maintained; its 3-D views work in one file without a network
@@ -18,6 +23,7 @@ TEST = [
     "scikit-learn>=1.3",
     "mcap>=1.1",
     "mcap-ros2-support>=0.5",
+    *CSV,
     *CLUSTER,
     *SMALL_GICP,
     *REPORT,
@@ -32,11 +38,11 @@ setup(
     maintainer_email="maintainers@cello3d.org",
     license="BSD-3-Clause",
     python_requires=">=3.11",
+    classifiers=[f"Programming Language :: Python :: 3.{minor}" for minor in (11, 12, 13)],
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={NAME: ["models/*.npz", "py.typed", "reporting/assets/*"]},
     zip_safe=False,
     install_requires=[
-        "setuptools",
         "numpy>=1.26,<2.5",
         "scipy>=1.11",
         "numba>=0.59",
@@ -46,11 +52,11 @@ setup(
         "tqdm>=4.60",
         "matplotlib>=3.6",
         "rosbags>=0.11,<0.12",
-        "pyarrow>=15",
     ],
     extras_require={
         "ros": ROS,
         "open3d": OPEN3D,
+        "csv": CSV,
         "cluster": CLUSTER,
         "small_gicp": SMALL_GICP,
         "report": REPORT,

@@ -62,3 +62,16 @@ class RecordingError(Cello3dError):
 
 class WriteError(Cello3dError):
     """A file or folder cannot be written."""
+
+
+def how_to_install(extra: str, error: Exception) -> str:
+    """Return what to do about an optional library that raised an error when imported.
+
+    A library that is there and cannot load lacks libraries of the system.
+    """
+    if isinstance(error, ModuleNotFoundError):
+        return f"pip install 'cello3d_ros[{extra}]' ({error})"
+    return (
+        f"it is installed, but a library of the system is missing ({error}): "
+        "apt-get install libgl1 libegl1 libgomp1 libx11-6 libusb-1.0-0 libidn2-0 libudev1"
+    )

@@ -79,3 +79,18 @@ def test_package_xml_names_nothing_that_is_not_imported():
     for key in keys_of_package_xml() - {"lifecycle_msgs"}:  # which rclpy.lifecycle imports
         name = names.get(key, key.removeprefix("python3-"))
         assert name in used, f"{key} is in package.xml but not imported"
+
+
+def test_every_requirement_of_setup_py_has_a_key_or_is_optional():
+    tree = ast.parse((ROOT / "setup.py").read_text())
+    words = {k.arg: k.value for n in ast.walk(tree) if isinstance(n, ast.Call) for k in n.keywords}
+    required = {
+        re.match(r"[\w-]+", str(r))[0] for r in ast.literal_eval(words["install_requires"])
+    }
+    assert "numpy" in required
+    modules = {pip: module for module, pip in OF_PIP.items()}
+    for name in required:
+        module = modules.get(name, name)
+        known = {f"python3-{module}", OF_ROSDEP.get(module)}
+        assert known & keys_of_package_xml(), f"{name} is required but has no key in package.xml"
+    assert not required & NO_KEY

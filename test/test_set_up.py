@@ -1,4 +1,4 @@
-"""The suite is collected wherever ROS, its pytest plugins and the optional libraries are or not."""
+"""The suite is collected with and without ROS, its pytest plugins and optional libraries."""
 
 import os
 import subprocess

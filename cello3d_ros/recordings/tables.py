@@ -82,7 +82,9 @@ def _parsed(rows: bytes, names: list[str], separator: str, where: object) -> dic
         import pyarrow
         from pyarrow import csv
     except ImportError:
-        raise RecordingError(f"{where}: reading CSV needs PyArrow: pip install pyarrow") from None
+        raise RecordingError(
+            f"{where}: reading CSV needs PyArrow: pip install 'cello3d_ros[csv]'"
+        ) from None
     try:
         table: Any = csv.read_csv(
             pyarrow.py_buffer(rows),

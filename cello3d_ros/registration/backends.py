@@ -21,7 +21,7 @@ from cello3d_ros.clouds.filters import subsample
 from cello3d_ros.clouds.leaves import in_threads
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
-from cello3d_ros.errors import ConfigError
+from cello3d_ros.errors import ConfigError, how_to_install
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.registration import icp
 from cello3d_ros.registration.icp import Registration
@@ -199,8 +199,7 @@ def _imported(module: str, title: str, extra: str, config: IcpConfig) -> Any:
         return importlib.import_module(module)
     except (ImportError, OSError) as error:
         raise ConfigError(
-            f"icp.backend {config.backend} needs {title}: "
-            f"pip install 'cello3d_ros[{extra}]' ({error})"
+            f"icp.backend {config.backend} needs {title}: {how_to_install(extra, error)}"
         ) from None
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cello3d_ros.errors import ConfigError, RecordingError
+from cello3d_ros.errors import ConfigError, RecordingError, how_to_install
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.simulation.meshes import Mesh
 
@@ -174,6 +174,6 @@ def import_open3d(purpose: str) -> Any:
         import open3d
     except (ImportError, OSError) as error:
         raise RecordingError(
-            f"{purpose} need Open3D: pip install 'cello3d_ros[open3d]' ({error})"
+            f"{purpose} need Open3D: {how_to_install('open3d', error)}"
         ) from error
     return open3d

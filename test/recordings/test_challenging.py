@@ -2,6 +2,7 @@
 
 import shutil
 import zipfile
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.recordings import open_recording
 from cello3d_ros.recordings.challenging import SEQUENCES, ChallengingRecording, sequence_of
+
+pytestmark = pytest.mark.skipif(find_spec("pyarrow") is None, reason="PyArrow is not installed")
 
 N = 12  # more than 10, so that text order is not integer order
 T = se3.exp(np.random.default_rng(0).normal(size=(N, 6)) * 0.7)

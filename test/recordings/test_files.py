@@ -29,6 +29,7 @@ def test_npy(tmp_path: Path, array) -> None:
 @pytest.mark.parametrize("separator", [",", ", ", ";", " ", "\t"])
 @pytest.mark.parametrize("mark", ["", "\ufeff"])
 def test_csv_with_columns_anywhere(tmp_path: Path, separator: str, end: str, mark: str) -> None:
+    pytest.importorskip("pyarrow")
     header = ["stamp", "Z", "y", "intensity", '"x"']
     rows = [[7, z, y, 0.5, x] for x, y, z in POINTS.tolist()]
     lines = [separator.join(str(v) for v in row) + end for row in [header, *rows]]
@@ -47,6 +48,7 @@ def test_ply_and_pcd(tmp_path: Path, ending: str) -> None:
 
 
 def test_points_that_are_not_finite_are_dropped(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
     bad = POINTS.copy()
     bad[3, 1], bad[7, 2] = np.nan, -np.inf
     np.save(tmp_path / "a.npy", bad)
@@ -86,6 +88,7 @@ def test_an_empty_file_is_an_error(tmp_path: Path, ending: str) -> None:
     ],
 )
 def test_a_csv_with_wrong_columns_is_an_error(tmp_path: Path, text: str, message: str) -> None:
+    pytest.importorskip("pyarrow")
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(RecordingError, match=message) as caught:
         read_cloud(tmp_path / "a.csv")

@@ -105,6 +105,7 @@ def plain(ending: str, file: str) -> Callable[[Path], tuple[Path, Path]]:
 
 def asl(file: str) -> Callable[[Path], tuple[Path, Path]]:
     def build(folder: Path) -> tuple[Path, Path]:
+        pytest.importorskip("pyarrow")
         (folder / "a").mkdir()
         names = ", ".join(f"T{i}{j}" for i in range(4) for j in range(4))
         rows = [f"poseId, timestamp, {names}\n"]

@@ -95,7 +95,7 @@ def test_a_missing_library_is_one_sentence(clouds, config, monkeypatch):
         pytest.skip("needs no library")
 
     def missing(name):
-        raise ImportError(f"No module named {name!r}")
+        raise ModuleNotFoundError(f"No module named {name!r}")
 
     monkeypatch.setattr(importlib, "import_module", missing)
     with pytest.raises(ConfigError, match=rf"icp.backend {config.backend} needs .*pip install"):
