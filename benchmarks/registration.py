@@ -1,4 +1,4 @@
-"""Time ICP on one case: one registration, a shared reference, redrawn clouds; beside others.
+"""Time ICP on one case: one registration, a whole reference, redrawn clouds; beside others.
 
 A case is a folder of ref_points.npy, ref_normals.npy, reading_points.npy and T0.npy (n, 4, 4);
 T_libpointmatcher.npy and iterations_libpointmatcher.npy are compared with when they are there.
@@ -20,13 +20,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
-from cello3d_ros.clouds.leaves import tree_order
+from cello3d_ros.clouds.leaves import select, tree_order
+from cello3d_ros.clouds.neighbors import build_tree, search
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import exp, transform
-from cello3d_ros.registration import icp as kernels
-from cello3d_ros.registration.candidates import Places, make_candidates, nearest
+from cello3d_ros.registration import kernels
 from cello3d_ros.registration.icp import icp, register_many
-from cello3d_ros.registration.search import build_tree, search
 
 _CONFIG = IcpConfig()
 
@@ -66,7 +65,7 @@ def measure(case: dict[str, Any], n: int) -> dict[str, Any]:
     read, ref, normals = case["reading_points"], case["ref_points"], case["ref_normals"]
     starts = np.resize(case["T0"], (n, 4, 4))
     clouds = in_order(read, np.zeros_like(read)), in_order(ref, normals)  # as prepared ones are
-    whole = IcpConfig(n_reading_points=len(read), n_reference_points=len(ref))
+    whole = IcpConfig(n_reading_points=0, n_reference_points=0)
     seeds = [[i] for i in range(n)]
 
     def single() -> list[Any]:
@@ -78,7 +77,7 @@ def measure(case: dict[str, Any], n: int) -> dict[str, Any]:
     seconds, found = timed(single)
     result: dict[str, Any] = {
         "registrations_per_cpu_second": n / seconds,
-        "shared_registrations_per_cpu_second": n
+        "whole_registrations_per_cpu_second": n
         / timed(lambda: register_many(*clouds, starts, seeds, whole))[0],
         "redrawn_registrations_per_cpu_second": n
         / timed(lambda: register_many(*clouds, starts, seeds, _CONFIG))[0],
@@ -117,22 +116,21 @@ def timed(work: Callable[[], Any]) -> tuple[float, Any]:
 
 def profile(read: Any, ref: Any, normals: Any, T: Any, n_runs: int = 50) -> dict[str, float]:
     """Time the three parts of an iteration where ICP ends, the neighbours known."""
-    moved = np.ascontiguousarray(transform(T, read[tree_order(read)]))
-    leaves = build_tree(ref)
-    ref, normals = leaves.points, np.ascontiguousarray(normals[leaves.order])
-    k = _CONFIG.n_neighbors
-    d2, indices = np.empty((len(read), k)), np.full((len(read), k), -1)
-    search(moved, leaves, np.inf, d2, indices)
+    queries = np.ascontiguousarray(transform(T, read[tree_order(read)]))
+    tree = build_tree(ref)
+    normals = normals[tree.order]
+    moved = queries - ref.mean(axis=0)
+    d2, indices = np.empty((len(read), _CONFIG.n_neighbors)), np.empty((len(read), 3), np.int64)
+    search(tree.leaves, queries, np.inf, d2, indices)
     rank = int(d2.size * _CONFIG.trim_ratio)
-    limit = kernels._of_rank(d2.ravel(), rank, np.inf)
-    centered = ref - ref.mean(axis=0)
-    places = Places(make_candidates(centered, k), np.zeros(len(read), np.int32))
-    from_mean, scratch = moved - ref.mean(axis=0), (np.empty_like(d2), np.empty_like(indices))
+    limit = np.partition(d2, rank, axis=None)[rank]
+    keys = np.arange(d2.size)
     parts = {
-        "search": lambda: search(moved, leaves, 1.2 * limit, d2, indices),
-        "search, shared reference": lambda: nearest(from_mean, places, 1.2 * limit, *scratch),
-        "trim": lambda: kernels._of_rank(d2.ravel(), rank, 1.2 * limit),
-        "accumulate": lambda: kernels._plane_step(moved, ref, normals, d2, indices, limit),
+        "search": lambda: search(tree.leaves, queries, 1.2 * limit, d2, indices),
+        "trim": lambda: select(d2.flatten(), keys, 0, d2.size, rank),
+        "accumulate": lambda: kernels._plane_step(
+            moved, queries, tree.points, normals, d2, indices, limit
+        ),
     }
     nanoseconds = {}
     for name, part in parts.items():

@@ -75,8 +75,16 @@ class IcpConfig(Section):
     rotation_epsilon_rad: float = _setting(1e-3, "mean rotation step that ends ICP", 0.0)
     translation_epsilon_m: float = _setting(1e-3, "mean translation step that ends ICP", 0.0)
     n_smoothed: int = _setting(3, "steps over which those means are taken", 1, 100)
-    n_reading_points: int = _setting(2000, "random subsample of the reading", 10)
-    n_reference_points: int = _setting(10000, "random subsample of the reference", 10)
+    n_reading_points: int = _setting(2000, "random subsample of the reading; 0 is all of it", 0)
+    n_reference_points: int = _setting(
+        10000, "random subsample of the reference; 0 is all of it, with the tree it has", 0
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("n_reading_points", "n_reference_points"):
+            if 0 < getattr(self, name) < 10:
+                raise ConfigError(f"IcpConfig.{name} must be 0 or at least 10")
 
 
 @dataclass(frozen=True, kw_only=True)

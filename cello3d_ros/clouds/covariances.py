@@ -2,26 +2,24 @@
 
 Only which points are among the k nearest matters, not their order, so that no list is kept
 sorted: the distances to all candidates are computed as vectors, then a threshold is looked for
-that k of them do not exceed.  The radius within which candidates are collected is guessed from the
-point before, and verified (``neighbors``).
+that k of them do not exceed (``gathering`` collects them).
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from cello3d_ros.clouds.lanes import boxes_near, count_row, distances_of, least_above, lowest_bit
-from cello3d_ros.clouds.leaves import WIDTH, Indices, Leaves, leaves_near
+from cello3d_ros.clouds.gathering import FAR2, LEAST2, gather, make_room
+from cello3d_ros.clouds.lanes import count_row, least_above
+from cello3d_ros.clouds.leaves import WIDTH, Indices, Leaves
+from cello3d_ros.compiled import kernel
 from cello3d_ros.geometry.se3 import Array
 
-_FAR2 = 1.7e308  # no finite squared distance is searched for beyond
-_LEAST2 = 1e-290  # from where a radius grows that was guessed to be nothing
 _FEW = 4  # distances left to go through one by one
 _TRIES = 12  # thresholds tried before that
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def covariances(leaves: Leaves, n: int, k: int, first: int, stop: int, out: Array) -> None:
     """Fill out[g - first], (6, 16), for the points of leaf g: xx, yy, zz, xy, xz, yz.
 
@@ -31,14 +29,10 @@ def covariances(leaves: Leaves, n: int, k: int, first: int, stop: int, out: Arra
     """
     points = leaves.points
     k = min(k, n)
-    near = np.empty(len(points), np.int64)
-    near_boxes = np.empty((len(points) // 16 + 1, 6, 16))
-    stack = np.empty(256, np.int64)
-    candidates = np.empty(len(points), np.int64)  # leaves, and the distances to their points
-    distances2 = np.empty(16 * len(points))
+    room = make_room(len(points))
     chosen = np.empty(16 * len(points) + 1, np.int64)
     box = np.empty(6)
-    guess2 = most2 = _LEAST2  # the last threshold; the greatest of the last leaf
+    guess2 = most2 = LEAST2  # the last threshold; the greatest of the last leaf
     for g in range(first, stop):
         size = min(WIDTH, n - WIDTH * g)
         for a in range(3):
@@ -46,66 +40,23 @@ def covariances(leaves: Leaves, n: int, k: int, first: int, stop: int, out: Arra
             for lane in range(size):
                 box[a] = min(box[a], points[g, a, lane])
                 box[3 + a] = max(box[3 + a], points[g, a, lane])
-        far2 = min(1.5 * most2, _FAR2)
-        growth, most2, lane, n_near = 2.0, _LEAST2, 0, -1
+        far2, most2, n_near = min(1.5 * most2, FAR2), LEAST2, -1
         out[g - first, :, size:] = 0.0
-        while lane < size:
-            if n_near < 0:
-                n_near = leaves_near(leaves, box, far2, stack, near, near_boxes)
+        for lane in range(size):
             x, y, z = points[g, 0, lane], points[g, 1, lane], points[g, 2, lane]
-            bound2 = min(1.3 * guess2, far2)
-            n_candidates, found = _candidates(
-                points, near, near_boxes, n_near, x, y, z, bound2, candidates, distances2
+            n_rows, found, bound2, far2, n_near = gather(
+                leaves, box, x, y, z, k, 1.3 * guess2, far2, FAR2, n_near, room
             )
-            while found < k and bound2 < far2:
-                bound2 = min(2.0 * bound2, far2)
-                n_candidates, found = _candidates(
-                    points, near, near_boxes, n_near, x, y, z, bound2, candidates, distances2
-                )
-            if found < k and far2 < _FAR2:
-                far2 = min(growth * far2, _FAR2)
-                growth, guess2, n_near = 2.0 * growth, far2, -1
-                continue
             threshold2 = bound2
             if found > k:
-                threshold2 = _threshold(distances2, n_candidates, k, guess2, bound2, found)
-            n_chosen = _choose(distances2, n_candidates, k, threshold2, chosen)
-            _covariance(points, candidates, chosen, n_chosen, x, y, z, out, g - first, lane)
-            guess2 = max(threshold2, _LEAST2)
+                threshold2 = _threshold(room.distances2, n_rows, k, guess2, bound2, found)
+            n_chosen = _choose(room.distances2, n_rows, k, threshold2, chosen)
+            _covariance(points, room.found, chosen, n_chosen, x, y, z, out, g - first, lane)
+            guess2 = max(threshold2, LEAST2)
             most2 = max(most2, guess2)
-            lane += 1
 
 
-@njit(cache=True, nogil=True)
-def _candidates(
-    points: Array,
-    near: Indices,
-    near_boxes: Array,
-    n_near: int,
-    x: float,
-    y: float,
-    z: float,
-    bound2: float,
-    candidates: Indices,
-    distances2: Array,
-) -> tuple[int, int]:
-    """Fill the leaves at most ``bound2`` away and the distances to their points, squared.
-
-    Returns how many leaves, and how many of the points are within the bound.
-    """
-    n = found = 0
-    for block in range((n_near + 15) >> 4):
-        mask = boxes_near(near_boxes, block, x, y, z, bound2)
-        while mask:
-            leaf = near[16 * block + lowest_bit(mask)]
-            mask &= mask - 1
-            candidates[n] = leaf
-            found += distances_of(points, leaf, x, y, z, bound2, distances2, n)
-            n += 1
-    return n, found
-
-
-@njit(cache=True, nogil=True)
+@kernel()
 def _count(distances2: Array, n_rows: int, most2: float) -> int:
     n = 0
     for row in range(n_rows):
@@ -113,7 +64,7 @@ def _count(distances2: Array, n_rows: int, most2: float) -> int:
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _threshold(
     distances2: Array, n_rows: int, k: int, guess2: float, high: float, n_high: int
 ) -> float:
@@ -143,7 +94,7 @@ def _threshold(
     return threshold2
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _choose(distances2: Array, n_rows: int, k: int, threshold2: float, chosen: Indices) -> int:
     """Fill the first k candidates within the threshold, all below it before any equal to it."""
     n = 0
@@ -164,7 +115,7 @@ def _choose(distances2: Array, n_rows: int, k: int, threshold2: float, chosen: I
     return n
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _covariance(
     points: Array,
     candidates: Indices,

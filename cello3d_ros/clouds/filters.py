@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from cello3d_ros.compiled import kernel
 from cello3d_ros.geometry.se3 import Array
 
 
@@ -31,12 +31,17 @@ def limit_density(
     return _kept(points, _first_of_cells(points, voxel_m, max_points, turns))
 
 
+def n_drawn(n_points: int, n_kept: int) -> int:
+    """Return how many of ``n_points`` a draw of ``n_kept`` has; 0 is a draw of all."""
+    return min(n_points, n_kept) if n_kept > 0 else n_points
+
+
 def subsample(n_points: int, n_kept: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Return ``n_kept`` of ``n_points`` indices, drawn without repetition, in increasing order.
 
-    All of them when there are no more than ``n_kept``.
+    All of them when there are no more than ``n_kept``, or when that is 0.
     """
-    if n_points <= n_kept:
+    if n_drawn(n_points, n_kept) == n_points:
         return np.arange(n_points)
     return np.sort(rng.choice(n_points, n_kept, replace=False, shuffle=False))
 
@@ -46,7 +51,7 @@ def _kept(points: Array, is_kept: NDArray[np.bool_]) -> Array:
     return points.take(np.flatnonzero(is_kept), axis=0)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _first_of_cells(
     points: Array, voxel_m: float, max_points: int, turns: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
@@ -91,7 +96,7 @@ def _first_of_cells(
     return kept
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _hash(x: float, y: float, z: float) -> int:
     """Return a number that neighbouring cells share by chance only (wrapping multiplication)."""
     h = np.uint64(np.int64(x)) * np.uint64(0x9E3779B97F4A7C15)

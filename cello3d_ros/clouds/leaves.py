@@ -12,21 +12,17 @@ every operation is monotone, so that a box is never farther than a point in it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.lanes import boxes_near_box, lowest_bit
+from cello3d_ros.compiled import kernel
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.threads import in_threads
 
 Indices = NDArray[np.int64]
-
-P = TypeVar("P")
-T = TypeVar("T")
 
 WIDTH = 16  # children of a node, points of a leaf
 
@@ -42,14 +38,6 @@ class Leaves(NamedTuple):
     points: Array
     boxes: Array
     children: Indices
-
-
-def in_threads(task: Callable[[P], T], parts: Sequence[P], n_threads: int) -> list[T]:
-    """Return what ``task`` makes of each part, in threads if there are more than one of both."""
-    if min(n_threads, len(parts)) <= 1:
-        return [task(part) for part in parts]
-    with ThreadPoolExecutor(min(n_threads, len(parts))) as pool:
-        return list(pool.map(task, parts))
 
 
 def tree_order(points: Array, n_threads: int = 1) -> Indices:
@@ -69,7 +57,7 @@ def tree_order(points: Array, n_threads: int = 1) -> Indices:
     return order
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _sort_range(points: Array, order: Indices, keys: Array, lo: int, hi: int) -> None:
     """Put order[lo:hi] into tree order; keys: scratch."""
     stack = np.empty((128, 2), np.int64)
@@ -86,7 +74,7 @@ def _sort_range(points: Array, order: Indices, keys: Array, lo: int, hi: int) ->
         top += 2
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _halve(points: Array, order: Indices, keys: Array, lo: int, hi: int) -> int:
     """Cut order[lo:hi] across the longest side of its box; return where."""
     if hi - lo <= WIDTH:
@@ -108,12 +96,12 @@ def _halve(points: Array, order: Indices, keys: Array, lo: int, hi: int) -> int:
         axis = 2
     for i in range(lo, hi):
         keys[i] = points[order[i], axis]
-    _select(keys, order, lo, hi, middle)
+    select(keys, order, lo, hi, middle)
     return middle
 
 
-@njit(cache=True, nogil=True)
-def _select(keys: Array, order: Indices, lo: int, hi: int, middle: int) -> None:
+@kernel()
+def select(keys: Array, order: Indices, lo: int, hi: int, middle: int) -> None:
     """Partition keys[lo:hi], and order with them, so that sorting would cut them at ``middle``.
 
     One pass moves all keys below the pivot to the front without a branch.  When there are none,
@@ -144,7 +132,7 @@ def _select(keys: Array, order: Indices, lo: int, hi: int, middle: int) -> None:
         lo = cut
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def build_leaves(points: Array) -> Leaves:
     """Build the tree of (N, 3) points, N > 0, given in ``tree_order``."""
     n = len(points)
@@ -180,7 +168,7 @@ def build_leaves(points: Array) -> Leaves:
         below, start, size = n_leaves + start, start + size, (size + WIDTH - 1) // WIDTH
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def leaves_near(
     leaves: Leaves,
     box: Array,

@@ -1,11 +1,8 @@
 """Exact nearest neighbours of many queries, sixteen at a time.
 
-They serve the local shape of a cloud and the overlap of two, hence this lowest room; ICP has a
-search of its own (``registration/search.py``).  Sixteen queries in a row look for their leaves
-together, within a radius that is guessed from the queries before.  The guess is verified: where
-it holds fewer than k points the search is done again with a greater one, so that the answers are
-exact whatever the guess, and do not depend on how the queries are shared among threads.  Of
-equally far points the first in the order of the tree wins.
+They serve ICP and the overlap of two clouds.  Sixteen queries in a row look for their leaves
+together, within a radius that is guessed from the queries before and verified (``gathering``).
+Of equally far points the first in the order of the tree wins.
 """
 
 from __future__ import annotations
@@ -13,32 +10,24 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from cello3d_ros.clouds.lanes import (
-    boxes_near,
-    distances_of,
-    lanes_of,
-    least_above,
-    lowest_bit,
-)
+from cello3d_ros.clouds.gathering import FAR2, LEAST2, gather, make_room
+from cello3d_ros.clouds.lanes import lanes_of, least_above, lowest_bit
 from cello3d_ros.clouds.leaves import (
     WIDTH,
     Indices,
     Leaves,
     build_leaves,
-    in_threads,
-    leaves_near,
     tree_order,
 )
+from cello3d_ros.compiled import kernel
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.threads import in_threads
 
-__all__ = ["Indices", "KdTree", "any_within", "build_tree", "nearest"]
+__all__ = ["Indices", "KdTree", "any_within", "build_tree", "nearest", "search"]
 
-_FAR2 = 1.7e308  # no finite squared distance is searched for beyond
 _CHUNK = 4096  # queries of one task, a multiple of 16
-_LEAST2 = 1e-290  # from where a radius grows that was guessed to be nothing
 
 
 class KdTree(NamedTuple):
@@ -84,7 +73,7 @@ def nearest(
     indices = np.empty((len(queries), k), np.int64)
 
     def task(part: slice) -> None:
-        _nearest(tree.leaves, queries[part], max_distance2, distances2[part], indices[part])
+        search(tree.leaves, queries[part], max_distance2, distances2[part], indices[part])
 
     parts = [slice(i, i + _CHUNK) for i in range(0, len(queries), _CHUNK)]
     in_threads(task, parts, n_threads)
@@ -99,54 +88,41 @@ def any_within(
     return np.asarray(indices[:, 0] >= 0)
 
 
-@njit(cache=True, nogil=True)
-def _nearest(
+@kernel()
+def search(
     leaves: Leaves, queries: Array, max2: float, distances2: Array, indices: Indices
-) -> None:
-    """Fill the neighbours of the queries, closest first.
+) -> int:
+    """Fill the k nearest points at most ``max2`` away, squared; return how many there are.
 
-    far2 is the search radius of the sixteen, squared, guess2 that of one: at most far2, less
-    where the neighbours of the query before say so.  Both grow until k are found within.  The
-    nearest are then taken from the distances to all candidates one by one, each the least that is
-    left, which vectors find without a branch.  One function, for calls with arrays cost as much
-    here as the search.
+    queries: (M, 3); distances2, indices: (M, k), as ``nearest`` returns them.  The k nearest are
+    taken from the distances to all candidates one by one, each the least that is left, which
+    vectors find without a branch.
     """
-    points = leaves.points
     n, k = indices.shape
-    max2 = min(max2, _FAR2)
-    near = np.empty(len(points), np.int64)
-    near_boxes = np.empty((len(points) // 16 + 1, 6, 16))
-    stack = np.empty(256, np.int64)
-    candidates = np.empty(len(points), np.int64)  # leaves, and the distances to their points
-    rows = np.empty(16 * len(points))
+    max2 = min(max2, FAR2)
+    room = make_room(len(leaves.points))
     box = np.empty(6)
-    last2 = most2 = _LEAST2  # the last k-th distance, squared; the greatest of the last sixteen
+    last2 = most2 = LEAST2  # the last k-th distance, squared; the greatest of the last sixteen
+    total = 0
     for start in range(0, n, WIDTH):
         stop = min(start + WIDTH, n)
         _box_around(queries, start, stop, box)
-        far2 = min(1.5 * most2, max2)
-        growth, most2, i, n_near = 2.0, _LEAST2, start, -1
-        guess2 = min(1.5 * last2, far2)
-        while i < stop:
-            if n_near < 0:
-                n_near = leaves_near(leaves, box, far2, stack, near, near_boxes)
-            x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
-            n_rows = found = 0
-            for block in range((n_near + 15) >> 4):
-                mask = boxes_near(near_boxes, block, x, y, z, guess2)
-                while mask:
-                    leaf = near[16 * block + lowest_bit(mask)]
-                    mask &= mask - 1
-                    candidates[n_rows] = leaf
-                    found += distances_of(points, leaf, x, y, z, guess2, rows, n_rows)
-                    n_rows += 1
-            if found < k and guess2 < far2:
-                guess2 = min(4.0 * guess2, far2)
-                continue
-            if found < k and far2 < max2:
-                far2 = min(growth * far2, max2)
-                growth, guess2, n_near = 2.0 * growth, far2, -1
-                continue
+        far2, most2, n_near = min(1.5 * most2, max2), LEAST2, -1
+        for i in range(start, stop):
+            n_rows, found, bound2, far2, n_near = gather(
+                leaves,
+                box,
+                queries[i, 0],
+                queries[i, 1],
+                queries[i, 2],
+                k,
+                1.5 * last2,
+                far2,
+                max2,
+                n_near,
+                room,
+            )
+            rows = room.distances2
             j, value = 0, -1.0
             while j < min(found, k):
                 value = least_above(rows, n_rows, value)
@@ -158,18 +134,18 @@ def _nearest(
                         lane = lowest_bit(mask)
                         mask &= mask - 1
                         distances2[i, j] = value
-                        indices[i, j] = 16 * candidates[first + (lane >> 4)] + (lane & 15)
+                        indices[i, j] = 16 * room.found[first + (lane >> 4)] + (lane & 15)
                         j += 1
-            last2 = max(value if found >= k else guess2, _LEAST2)
-            guess2 = min(1.5 * last2, far2)
+            last2 = max(value if found >= k else bound2, LEAST2)
             most2 = max(most2, last2)
+            total += j
             while j < k:
                 distances2[i, j], indices[i, j] = np.inf, -1
                 j += 1
-            i += 1
+    return total
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _box_around(queries: Array, start: int, stop: int, box: Array) -> None:
     """Fill box, (6,), with the least and greatest coordinates of queries[start:stop]."""
     for a in range(3):

@@ -6,15 +6,16 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from cello3d_ros.clouds.covariances import covariances
 from cello3d_ros.clouds.filters import crop_range, limit_density
-from cello3d_ros.clouds.leaves import WIDTH, in_threads
+from cello3d_ros.clouds.leaves import WIDTH
 from cello3d_ros.clouds.neighbors import KdTree, build_tree
+from cello3d_ros.compiled import kernel
 from cello3d_ros.config import CloudConfig
 from cello3d_ros.errors import CloudError
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.threads import in_threads
 
 _CHUNK = 256  # leaves of one task
 
@@ -96,7 +97,7 @@ def local_shape(tree: KdTree, k: int, n_threads: int = 1) -> tuple[Array, Array,
     return normals, planarity, cylindricality
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _shape(near: Array, normals: Array, planarity: Array, cylindricality: Array) -> None:
     """Fill the shape of each covariance of near, (L, 6, 16).
 
@@ -123,7 +124,7 @@ def _shape(near: Array, normals: Array, planarity: Array, cylindricality: Array)
         _write(w, WIDTH * g, normals, planarity, cylindricality)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _sweep(w: Array) -> None:
     """Rotate each matrix of w in the planes of x and y, x and z, y and z, if it needs it yet."""
     for lane in range(16):
@@ -158,7 +159,7 @@ def _sweep(w: Array) -> None:
         w[192 + lane], w[208 + lane], w[224 + lane] = cx, cy, cz
 
 
-@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+@kernel(inline="always", error_model="numpy")
 def _rotation(pp: float, qq: float, pq: float, live: bool) -> tuple[float, float, float]:
     """Return cosine, sine and tangent of the rotation that makes pq 0; none if it is not live."""
     theta = 0.5 * (qq - pp) / pq
@@ -169,7 +170,7 @@ def _rotation(pp: float, qq: float, pq: float, live: bool) -> tuple[float, float
     return c, t * c, t
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _write(w: Array, first: int, normals: Array, planarity: Array, cylindricality: Array) -> None:
     """Write the shapes of the diagonal matrices of w, from point ``first`` on."""
     for lane in range(min(16, len(normals) - first)):

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from cello3d_ros.clouds.filters import n_drawn
 from cello3d_ros.clouds.neighbors import Indices
 from cello3d_ros.clouds.shape import Cloud, has_shape
+from cello3d_ros.compiled import kernel
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry.gaussian import symmetrized
@@ -158,7 +159,7 @@ def _trim_limit(distances2: Array, config: IcpConfig) -> float:
 
 def _drawn(reading: Cloud, config: IcpConfig) -> float:
     """Return how many times fewer points of the reading ICP draws than there are."""
-    return len(reading.points) / min(len(reading.points), config.n_reading_points)
+    return len(reading.points) / n_drawn(len(reading.points), config.n_reading_points)
 
 
 def _inverse(H: Array) -> Array:
@@ -172,7 +173,7 @@ def _inverse(H: Array) -> Array:
     return np.asarray(np.outer(scale, scale) * ((vectors / eigenvalues) @ vectors.T))
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _normal_matrices(
     reading: Array,
     moved: Array,

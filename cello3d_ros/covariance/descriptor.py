@@ -6,10 +6,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.shape import Cloud, has_shape
+from cello3d_ros.compiled import kernel
 from cello3d_ros.config import GridConfig
 from cello3d_ros.geometry.se3 import Array
 
@@ -85,7 +85,7 @@ def _describe(
     return (sums / np.maximum(counts, 1.0)[:, None]).ravel()
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _sum_cells(
     points: Array,
     normals: Array,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from cello3d_ros.clouds.filters import n_drawn
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.covariance.closed_form import ClosedForm
@@ -62,8 +63,8 @@ def global_features(
     ratios = np.maximum(np.linalg.eigvalsh(root.T @ S @ root) / rms**2, _LEAST)
     against = ratios[0], np.exp(np.log(ratios).mean()), ratios[-1]
     drawn = (
-        len(reading.points) / min(len(reading.points), config.n_reading_points),
-        len(reference.points) / min(len(reference.points), config.n_reference_points),
+        len(reading.points) / n_drawn(len(reading.points), config.n_reading_points),
+        len(reference.points) / n_drawn(len(reference.points), config.n_reference_points),
     )
     motion = np.linalg.norm(T_ref_read[:3, 3]) + _MOTION_M
     condition, n = variances[-1] / variances[0], found.n_associations

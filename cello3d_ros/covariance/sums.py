@@ -10,10 +10,10 @@ triangles, 21 numbers in place of 36.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from cello3d_ros.compiled import kernel
 from cello3d_ros.geometry.se3 import Array
 
 _ROWS, _COLUMNS = np.triu_indices(6)
@@ -53,7 +53,7 @@ def weighted_sum(weights: Array, rows: Array) -> Array:
 
 
 # reassociation lets the sum over r be done in vectors; no law rests on its order
-@numba.njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
+@kernel(fastmath={"reassoc", "contract"})
 def _squared_distances(
     points: NDArray[np.float64], query: NDArray[np.float64], found: NDArray[np.float64]
 ) -> None:
@@ -65,7 +65,7 @@ def _squared_distances(
         found[k] = total
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel()
 def _weighted_sum(
     weights: NDArray[np.float64], rows: NDArray[np.float64], total: NDArray[np.float64]
 ) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.filters import subsample
-from cello3d_ros.clouds.leaves import in_threads
 from cello3d_ros.clouds.neighbors import build_tree
 from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import IcpConfig, Pipeline
@@ -20,6 +19,7 @@ from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.backends import register
 from cello3d_ros.registration.icp import Registration
 from cello3d_ros.simulation.scanner import Echoes, measure
+from cello3d_ros.threads import in_threads
 
 
 def register_many_noisy(

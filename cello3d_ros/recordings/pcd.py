@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from cello3d_ros.compiled import kernel
 from cello3d_ros.errors import RecordingError
 
 _MAX_RATIO = 264 / 3  # LZF copies at most 264 bytes with 3
@@ -98,7 +98,7 @@ def _compressed(
     return found
 
 
-@njit(cache=True)
+@kernel()
 def _lzf(data: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
     """Decompress LZF (Lehmann's liblzf) into ``out``; return the bytes written, -1 if damaged."""
     i, o, n, size = 0, 0, data.size, out.size

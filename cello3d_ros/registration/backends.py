@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.filters import subsample
-from cello3d_ros.clouds.leaves import in_threads
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.errors import ConfigError, how_to_install
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.registration import icp
 from cello3d_ros.registration.icp import Registration
+from cello3d_ros.threads import in_threads
 
 _FEWEST_ASSOCIATIONS = 6  # as many as a rigid motion has degrees of freedom
 _SMALL_GICP_NEIGHBORS = 20  # of the covariance of a point of the subsample

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.neighbors import Indices, any_within, nearest
 from cello3d_ros.clouds.shape import Cloud
+from cello3d_ros.compiled import kernel
 from cello3d_ros.geometry.se3 import Array, inverse, transform
 
 
@@ -62,7 +62,7 @@ def find_overlap(
     return Overlap(near, overlaps, distances2, indices)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _mark(
     distances2: Array,
     indices: Indices,

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from cello3d_ros.clouds.neighbors import nearest
+from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig, Pipeline
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array
@@ -28,17 +29,13 @@ def make(n_samples: int, n_threads: int, seed: int) -> Result:
     xi = _sampled(n_samples, pipeline, n_threads, seed)
     Y = sampled_covariance(xi)
     C = censi_of(reading, reference, np.eye(4), pipeline, SIGMA_M)
-    tree = cKDTree(reference.points)
     grids = []
     for half in _HALF_WIDTHS_M:
         steps = np.linspace(-half, half, _N_GRID)
         shifts = np.stack(
             [*np.meshgrid(steps, steps, indexing="xy"), np.zeros((_N_GRID,) * 2)], -1
         )
-        J = [
-            objective(reading.points + t, reference.points, reference.normals, tree, pipeline.icp)
-            for t in shifts.reshape(-1, 3)
-        ]
+        J = [objective(reading.points + t, reference, pipeline.icp) for t in shifts.reshape(-1, 3)]
         grids.append(np.reshape(J, (_N_GRID, _N_GRID)))
     data = {
         "sigma_m": SIGMA_M,
@@ -65,15 +62,13 @@ def make(n_samples: int, n_threads: int, seed: int) -> Result:
     return Result("fig-objective", title, text, data, rows, _figure(grids, xi, Y, C))
 
 
-def objective(
-    moved: Array, points: Array, normals: Array, tree: cKDTree, config: IcpConfig
-) -> float:
+def objective(moved: Array, reference: Cloud, config: IcpConfig) -> float:
     """Return the mean squared point-to-plane error of the kept associations, as ICP has it."""
-    distances, indices = tree.query(moved, k=config.n_neighbors)
-    rank = min(int(distances.size * config.trim_ratio), distances.size - 1)
-    kept = distances <= np.partition(distances, rank, axis=None)[rank]
-    offsets = moved[:, None] - points[indices]
-    r = np.einsum("nki,nki->nk", offsets, normals[indices])
+    distances2, indices = nearest(reference.tree, moved, config.n_neighbors)
+    rank = min(int(distances2.size * config.trim_ratio), distances2.size - 1)
+    kept = distances2 <= np.partition(distances2, rank, axis=None)[rank]
+    offsets = moved[:, None] - reference.points[indices]
+    r = np.einsum("nki,nki->nk", offsets, reference.normals[indices])
     return float(np.mean(r[kept] ** 2))
 
 

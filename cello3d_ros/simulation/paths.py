@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from cello3d_ros.clouds.neighbors import build_tree, nearest
 from cello3d_ros.geometry.se3 import Array
 
 _MAX_TURN_RAD = np.radians(12.0)  # a step; the sway adds about 2
@@ -33,8 +33,12 @@ class Route:
 
     def nearest(self, xy: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
         """Return that distance, and the index of the nearest point of the curve."""
-        distance, index = cKDTree(self.points[:, :2]).query(np.asarray(xy, dtype=np.float64))
-        return np.asarray(distance), np.asarray(index)
+        xy = np.asarray(xy, dtype=np.float64)
+        tree = build_tree(self.points * [1.0, 1.0, 0.0])
+        flat = np.pad(xy.reshape(-1, 2), ((0, 0), (0, 1)))
+        distances2, indices = nearest(tree, flat, 1)
+        shape = xy.shape[:-1]
+        return np.sqrt(distances2).reshape(shape), tree.order[indices].reshape(shape)
 
 
 def smooth(corners: ArrayLike, closed: bool, spacing_m: float = 0.05) -> Route:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from cello3d_ros.clouds.leaves import WIDTH, build_leaves, leaves_near, tree_order
+from cello3d_ros.clouds.leaves import WIDTH, build_leaves, leaves_near, select, tree_order
 
 
 def a_tree(n):
@@ -60,3 +60,16 @@ def test_leaves_are_more_compact_than_a_random_order():
     extent = np.ptp(leaves.points, axis=2).prod(axis=1)
     shuffled = np.random.default_rng(0).permutation(points).reshape(-1, WIDTH, 3)
     assert np.median(extent) < 0.02 * np.median(np.ptp(shuffled, axis=1).prod(axis=1))
+
+
+def test_selecting_puts_at_a_rank_what_sorting_does():
+    rng = np.random.default_rng(23)
+    for values in (rng.random(3000), np.repeat(rng.random(3), 500), np.zeros(50)):
+        values = np.append(rng.permutation(values), [np.inf, np.inf])
+        for rank in (0, len(values) // 2, len(values) - 3, len(values) - 1):
+            keys, order = values.copy(), np.arange(len(values))
+            select(keys, order, 0, len(keys), rank)
+            assert keys[rank] == np.sort(values)[rank]
+            np.testing.assert_array_equal(keys, values[order])
+            assert (keys[:rank] <= keys[rank]).all()
+            assert (keys[rank:] >= keys[rank]).all()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cello3d_ros.clouds.neighbors import any_within, build_tree, nearest
+from cello3d_ros.clouds.neighbors import any_within, build_tree, nearest, search
 
 CASES = {
     "normal": lambda rng: rng.normal(size=(2000, 3)),
@@ -23,6 +23,11 @@ CASES = {
         ],
         axis=1,
     ),
+    "far outliers": lambda rng: np.vstack([rng.normal(size=(900, 3)), 1e9 * np.eye(3)]),
+    "a node and a point": lambda rng: rng.normal(size=(257, 3)),
+    "a sphere": lambda rng: (
+        (p := rng.normal(size=(2000, 3))) / np.linalg.norm(p, axis=1, keepdims=True)
+    ),
     "one": lambda rng: rng.normal(size=(1, 3)),
     "far from the origin": lambda rng: rng.normal(size=(1000, 3)) + 1e6,
 }
@@ -34,6 +39,7 @@ def test_neighbors_are_those_of_an_independent_tree(case, k):
     rng = np.random.default_rng(7)
     points = CASES[case](rng)
     queries = np.vstack([points[:200], points.mean(axis=0) + 3 * rng.normal(size=(300, 3))])
+    queries[-1] += 1e7
     tree = build_tree(points)
     assert sorted(tree.order) == list(range(len(points)))
     np.testing.assert_array_equal(tree.points, points[tree.order])
@@ -68,6 +74,26 @@ def test_neighbors_beyond_the_largest_distance_are_left_out():
     near2, near = nearest(tree, queries, 4, max_distance2=0.09)
     np.testing.assert_array_equal(near2, np.where(every2 <= 0.09, every2, np.inf))
     np.testing.assert_array_equal(near, np.where(every2 <= 0.09, indices, -1))
+
+
+@pytest.mark.parametrize("max2", [np.inf, 0.09, 0.0])
+def test_the_search_counts_what_it_finds(max2):
+    rng = np.random.default_rng(12)
+    tree = build_tree(rng.normal(size=(2000, 3)))
+    queries = np.vstack([tree.points[:40], rng.normal(size=(60, 3))])
+    distances2, indices = np.empty((100, 3)), np.empty((100, 3), np.int64)
+    n_found = search(tree.leaves, queries, max2, distances2, indices)
+    assert n_found == (indices >= 0).sum() == np.isfinite(distances2).sum() >= 40
+
+
+@pytest.mark.parametrize("scale", [1e-120, 1e-30, 1e30, 1e140])
+def test_the_search_does_not_depend_on_the_unit_of_length(scale):
+    rng = np.random.default_rng(28)
+    points, queries = rng.normal(size=(700, 3)), rng.normal(size=(90, 3))
+    plain, scaled = build_tree(points), build_tree(scale * points)
+    one, other = nearest(plain, queries, 3), nearest(scaled, scale * queries, 3)
+    np.testing.assert_array_equal(plain.order[one[1]], scaled.order[other[1]])
+    np.testing.assert_allclose(np.sqrt(other[0]), scale * np.sqrt(one[0]), rtol=1e-12)
 
 
 def test_a_tree_has_the_same_order_whatever_the_number_of_threads():
