@@ -17,6 +17,7 @@ CSV = ["pyarrow>=15"]  # reads clouds and poses in CSV files; has no rosdep key
 CLUSTER = ["distributed>=2024.1"]
 SMALL_GICP = ["small_gicp>=1.0"]
 REPORT = ["plotly>=6"]  # maintained; its 3-D views work in one file without a network
+FUSION = ["gtsam>=4.3"]  # pose graphs; its wheels take the numpy of today
 BENCH = ["kiss-icp>=1.2"]  # what benchmarks/online.py compares with
 TEST = [
     "pytest",
@@ -61,6 +62,7 @@ setup(
         "small_gicp": SMALL_GICP,
         "report": REPORT,
         "test": TEST,
+        "fusion": FUSION,
         "bench": BENCH,
         "dev": [*TEST, "ruff", "mypy", "import-linter", "types-PyYAML", "playwright"],
     },

@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cello3d_ros.config import COVARIANCE_MODES
-from cello3d_ros.errors import CloudError, RecordingError
+from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.se3 import Array, is_rigid
 
 if TYPE_CHECKING:
@@ -39,72 +39,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Print the pose and the covariance of one pair."""
-    from cello3d_ros.clouds.shape import Cloud, prepare
     from cello3d_ros.covariance.estimator import Estimator
-    from cello3d_ros.covariance.model import find_model, load_model
     from cello3d_ros.recordings.files import read_cloud
 
-    model = load_model(find_model(arguments.model))
     T_init = _read_pose(Path(arguments.init)) if arguments.init else np.eye(4)
-    rng = np.random.default_rng(arguments.seed)
-
-    def cloud(path: str) -> Cloud:
-        try:
-            return prepare(read_cloud(Path(path)), model.pipeline.cloud, rng)
-        except CloudError as error:
-            raise CloudError(f"{path}: {error}") from None
-
-    reading, reference = cloud(arguments.reading), cloud(arguments.reference)
-    estimator = Estimator(model, arguments.method)
-    answer = as_dict(estimator.register(reading, reference, T_init, rng))
-    print(json.dumps(answer, indent=2) if arguments.json else _as_text(answer))
+    estimator = Estimator(arguments.model, arguments.method)
+    reading, reference = read_cloud(arguments.reading), read_cloud(arguments.reference)
+    found = estimator(reading, reference, T_init, arguments.seed)
+    print(json.dumps(found.to_dict(), indent=2) if arguments.json else _as_text(found))
 
 
-def as_dict(estimate: Estimate) -> dict[str, Any]:
-    """Return an estimate as plain numbers.
-
-    T_ref_read: 16, row by row.  covariance: 36, as ROS has it: position along and rotation about
-    the fixed axes of the reference.  covariance_reading: 36, of ``T_ref_read exp(xi)``.
-    """
-    from cello3d_ros.geometry.gaussian import to_fixed_axes
-
-    registration = estimate.registration
-    T = registration.T_ref_read
-    return {
-        "T_ref_read": T.ravel().tolist(),
-        "covariance": to_fixed_axes(T[:3, :3], estimate.covariance).ravel().tolist(),
-        "covariance_reading": estimate.covariance.ravel().tolist(),
-        "overlap_ratio": estimate.overlap_ratio,
-        "iterations": registration.n_iterations,
-        "converged": registration.converged,
-        "residual_rms_m": registration.residual_rms_m,
-        "associations": registration.n_associations,
-        "method": estimate.method,
-        "nearest_rho": estimate.nearest_rho,
-        "novelty": estimate.novelty,
-        "probably_lost": estimate.is_lost,
-        "effective_neighbors": estimate.effective_neighbors,
-    }
-
-
-def _as_text(answer: dict[str, Any]) -> str:
-    T = np.reshape(answer["T_ref_read"], (4, 4))
-    sigmas = np.sqrt(np.diag(np.reshape(answer["covariance"], (6, 6))))
-    state = "converged" if answer["converged"] else "did NOT converge: do not rely on this"
-    if answer["probably_lost"]:
-        state += ", but probably to a WRONG pose, in another minimum,"
+def _as_text(found: Estimate) -> str:
+    sigmas = np.sqrt(np.diag(found.covariance_ros()))
     return "\n".join(
         [
             "T_ref_read",
-            *("  " + "  ".join(f"{value:12.6f}" for value in row) for row in T),
+            *("  " + "  ".join(f"{value:12.6f}" for value in row) for row in found.T_ref_read),
             "standard deviations along and about the reference's axes",
             "  x, y, z    " + "  ".join(f"{value:.5f}" for value in sigmas[:3]) + "  m",
             "  rotation   " + "  ".join(f"{value:.6f}" for value in sigmas[3:]) + "  rad",
-            f"ICP {state} after {answer['iterations']} iterations, "
-            f"{answer['overlap_ratio']:.0%} of the reading overlaps",
-            f"nearest example at rho {answer['nearest_rho']:.3g}, "
-            f"{answer['effective_neighbors']:.1f} effective neighbors, novelty "
-            f"{answer['novelty']:.2f}",
+            f"ICP converged after {found.registration.n_iterations} iterations, "
+            f"{found.overlap_ratio:.0%} of the reading overlaps",
+            f"{found.trust.sentence} (novelty {found.novelty:.2f}, "
+            f"{found.effective_neighbors:.1f} effective neighbors)",
         ]
     )
 

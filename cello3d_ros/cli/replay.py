@@ -42,12 +42,12 @@ def run(arguments: argparse.Namespace) -> None:
     Raises Cello3dError; RecordingError when no pair was answered.
     """
     from cello3d_ros.config import PIPELINE, Config, load_config
-    from cello3d_ros.covariance.model import find_model, load_model
+    from cello3d_ros.covariance.model import load_model
     from cello3d_ros.tracking.offline import replay
     from cello3d_ros.tracking.tracker import Tracker
 
     recording = open_source(arguments.recording, arguments)
-    model = load_model(find_model(arguments.model))
+    model = load_model(arguments.model)
     node = load_config(arguments.config).node if arguments.config else Config().node
     config = Config(**{name: getattr(model.pipeline, name) for name in PIPELINE}, node=node)
     tracker = Tracker(model, config, node)
@@ -104,7 +104,7 @@ def _recorded(
         C = _published(answer.estimate.covariance, T_ref_read, config)
         C_chain = _published(answer.Y_chain, answer.T_odom_read, config)
         poses.write(tum_line(stamp_ns, answer.T_odom_read))
-        lines.write(json.dumps(_as_dict(answer, C, C_chain)) + "\n")
+        lines.write(json.dumps(_as_dict(answer)) + "\n")
         yield (
             f"{_PREFIX}/relative_pose",
             stamp_ns,
@@ -125,21 +125,14 @@ def _published(Y: Array, T: Array, config: NodeConfig) -> Array:
     )
 
 
-def _as_dict(answer: Answer, C: Array, C_chain: Array) -> dict[str, Any]:
-    """Return an answer as plain numbers; matrices row by row, covariances as ROS has them."""
-    estimate = answer.estimate
+def _as_dict(answer: Answer) -> dict[str, Any]:
+    """Return an answer as plain numbers under the names that they have in Python."""
     return {
         "stamp_ns": answer.stamp_ns,
         "reference_ns": answer.reference_ns,
-        "T_ref_read": estimate.registration.T_ref_read.ravel().tolist(),
-        "covariance": C.ravel().tolist(),
+        **answer.estimate.to_dict(),
         "T_odom_read": answer.T_odom_read.ravel().tolist(),
-        "covariance_chain": C_chain.ravel().tolist(),
-        "iterations": estimate.registration.n_iterations,
-        "residual_rms_m": estimate.registration.residual_rms_m,
-        "overlap_ratio": estimate.overlap_ratio,
-        "nearest_rho": estimate.nearest_rho,
-        "effective_neighbors": estimate.effective_neighbors,
+        "Y_chain": answer.Y_chain.ravel().tolist(),
     }
 
 

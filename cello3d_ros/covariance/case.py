@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,8 +22,9 @@ class MethodSettings(NamedTuple):
     sigma_m: standard deviation of the sensor's noise along each axis; n_registrations: extra runs
     of ICP by ``monte_carlo`` and ``fused``; unknown_quantile: the ``novelty`` beyond which a pair
     is unknown, i.e. unlike all examples; widen_unknown: whether the model's prediction for an
-    unknown pair is widened to the mean of the examples; scale: factor on every covariance;
-    n_threads changes no result.
+    unknown pair is widened to the mean of the examples; scale: factor on every covariance, which
+    is then kept within floor_sigma_m, floor_sigma_rad and ceiling (``bounded``); n_threads changes
+    no result.
     """
 
     sigma_m: float = 0.01
@@ -30,7 +32,10 @@ class MethodSettings(NamedTuple):
     unknown_quantile: float = 0.99
     widen_unknown: bool = True
     scale: float = 1.0
-    n_threads: int = 1
+    floor_sigma_m: float = 1e-4
+    floor_sigma_rad: float = 1e-5
+    ceiling: float = 900.0
+    n_threads: int = min(os.cpu_count() or 1, 4)  # more than that is not worth starting
 
 
 DEFAULTS = MethodSettings()

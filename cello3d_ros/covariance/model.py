@@ -232,8 +232,12 @@ def save_model(model: Model, path: Path | str) -> None:
     write_arrays(path, {"header": np.frombuffer(header, dtype=np.uint8), **arrays})
 
 
-def load_model(path: Path | str) -> Model:
-    """Read a model, every bit as saved.  Raises ModelError naming the file and what is wrong."""
+def load_model(name: Path | str = "general") -> Model:
+    """Read a model, every bit as saved: a file, or one of ``SHIPPED`` by its name.
+
+    Raises ModelError naming the file and what is wrong.
+    """
+    path = find_model(name)
     header = _read_header(path)
     is_new = header["format_version"] == FORMAT_VERSION
     names = (*_ARRAYS, *_NEW_ARRAYS) if is_new else _ARRAYS

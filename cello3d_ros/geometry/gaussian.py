@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from cello3d_ros.geometry.se3 import Array, adjoint, inverse
 
 _MARGIN = 1e-14  # smallest eigenvalue of a correlation matrix that rounding cannot have made
+_CONDITION = 1e-13  # least ratio of eigenvalues that still is positive definite when rounded
 _ASYMMETRY = 1e-9  # largest difference of mirrored correlations that rounding can have made
 
 
@@ -164,6 +165,23 @@ def larger(A: ArrayLike, B: ArrayLike) -> Array:
     return symmetrized((root * np.maximum(values, 1.0)) @ root.T)
 
 
+def bounded(C: Array, floor_sigma_m: float, floor_sigma_rad: float, ceiling: float) -> Array:
+    """Return C between the floors D = diag(floor_sigma_m^2, floor_sigma_rad^2) and the ceiling.
+
+    C: (6, 6), finite.  Returns a matrix that is exactly symmetric, positive definite, and
+    ``D <= C <= ceiling I`` in the sense of positive semidefinite differences; C itself where it is
+    so already.  A floor above the ceiling is lowered to it.
+    """
+    ceiling *= 1.0 - 1e-9  # so that rounding does not pass it
+    unit = np.minimum(np.repeat([floor_sigma_m, floor_sigma_rad], 3), np.sqrt(0.999 * ceiling))
+    C = _scaled(_clamped(_scaled(C, 1.0 / unit), 1.0, np.inf), unit)
+    if np.linalg.norm(C, 2) > ceiling:
+        D = np.diag(unit**2)
+        room = np.sqrt(ceiling - unit**2)
+        C = D + _scaled(_clamped(_scaled(C - D, 1.0 / room), 0.0, 1.0), room)
+    return _clamped(C, _CONDITION * float(np.linalg.norm(C, 2)), np.inf)
+
+
 def matrix_sqrt(S: ArrayLike) -> Array:
     """Return the symmetric R with ``R R = S``.  (..., d, d); LinAlgError if not positive."""
     return _power(S, 0.5)
@@ -228,3 +246,16 @@ def _b_matrix(Y: Array, S: Array) -> Array:
     B[..., 3:, :3] = _transposed(B[..., :3, 3:])
     B[..., 3:, 3:] = _bracket2(Ypp, Spp)
     return B
+
+
+def _scaled(C: Array, unit: Array) -> Array:
+    """Return ``diag(unit) C diag(unit)``."""
+    return np.asarray(unit[:, None] * C * unit)
+
+
+def _clamped(A: Array, low: float, high: float) -> Array:
+    """Return a symmetric matrix with its eigenvalues moved into [low, high]."""
+    values, vectors = np.linalg.eigh(A)
+    if low <= values[0] and values[-1] <= high:
+        return symmetrized(A)
+    return symmetrized((vectors * np.clip(values, low, high)) @ vectors.T)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from cello3d_ros.errors import CovarianceError
-from cello3d_ros.geometry.gaussian import symmetrized, to_fixed_axes
+from cello3d_ros.geometry.gaussian import bounded, symmetrized, to_fixed_axes
 from cello3d_ros.geometry.se3 import Array
 
 N_SIGMA = 3.0  # of what is shown and judged
 
-_CONDITION = 1e-13  # least ratio of eigenvalues that still is positive definite when rounded
 _HUGE = 1e12  # times the ceiling: beyond it a covariance is scaled down, so that nothing overflows
 
 
@@ -44,23 +43,6 @@ def twist_covariance(
     return bounded(C, floor_sigma_m / dt_s, floor_sigma_rad / dt_s, ceiling)
 
 
-def bounded(C: Array, floor_sigma_m: float, floor_sigma_rad: float, ceiling: float) -> Array:
-    """Return C between the floors D = diag(floor_sigma_m^2, floor_sigma_rad^2) and the ceiling.
-
-    C: (6, 6), finite.  Returns a matrix that is exactly symmetric, positive definite, and
-    ``D <= C <= ceiling I`` in the sense of positive semidefinite differences; C itself where it is
-    so already.  A floor above the ceiling is lowered to it.
-    """
-    ceiling *= 1.0 - 1e-9  # so that rounding does not pass it
-    unit = np.minimum(np.repeat([floor_sigma_m, floor_sigma_rad], 3), np.sqrt(0.999 * ceiling))
-    C = _scaled(_clamped(_scaled(C, 1.0 / unit), 1.0, np.inf), unit)
-    if np.linalg.norm(C, 2) > ceiling:
-        D = np.diag(unit**2)
-        room = np.sqrt(ceiling - unit**2)
-        C = D + _scaled(_clamped(_scaled(C - D, 1.0 / room), 0.0, 1.0), room)
-    return _clamped(C, _CONDITION * float(np.linalg.norm(C, 2)), np.inf)
-
-
 def principal_axes(C: Array) -> tuple[Array, Array]:
     """Return the standard deviations (3,) of a (3, 3) covariance, largest first, and their axes.
 
@@ -81,16 +63,3 @@ def _tamed(Y: Array, ceiling: float) -> Array:
     largest = float(np.abs(Y).max())
     scale = min(1.0, _HUGE * ceiling / largest) if largest > 0.0 else 1.0
     return symmetrized(np.asarray(Y, dtype=np.float64) * scale)
-
-
-def _scaled(C: Array, unit: Array) -> Array:
-    """Return ``diag(unit) C diag(unit)``."""
-    return np.asarray(unit[:, None] * C * unit)
-
-
-def _clamped(A: Array, low: float, high: float) -> Array:
-    """Return a symmetric matrix with its eigenvalues moved into [low, high]."""
-    values, vectors = np.linalg.eigh(A)
-    if low <= values[0] and values[-1] <= high:
-        return symmetrized(A)
-    return symmetrized((vectors * np.clip(values, low, high)) @ vectors.T)

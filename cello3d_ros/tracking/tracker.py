@@ -14,7 +14,7 @@ import numpy as np
 from cello3d_ros.clouds.shape import filtered, with_shape
 from cello3d_ros.config import NodeConfig, Pipeline
 from cello3d_ros.covariance.case import MethodSettings
-from cello3d_ros.covariance.estimator import Estimate, Estimator, needs_shape
+from cello3d_ros.covariance.estimator import Estimate, Estimator, draws, needs_shape
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import ModelError, RegistrationError
 from cello3d_ros.geometry.gaussian import GaussianPose, compound_right, is_positive_definite
@@ -115,7 +115,7 @@ class Tracker:
         against it; then the chain starts again at the last of them.  It starts again at once
         where nothing has fitted the first scan of a chain and two scans after it fit each other.
         """
-        rng = np.random.default_rng([self.config.seed, stamp_ns & (2**64 - 1)])
+        rng = draws(points, self.config.seed)
         cloud = filtered(points, self.pipeline.cloud, rng, _N_THREADS)
         frame = Frame(stamp_ns, cloud, place, place.T_odom_sensor)
         if needs_shape(self.model, self.pipeline):
@@ -283,6 +283,9 @@ class Tracker:
             unknown_quantile=config.unknown_quantile,
             widen_unknown=config.inflate_unknown,
             scale=config.scale,
+            floor_sigma_m=config.floor_sigma_m,
+            floor_sigma_rad=config.floor_sigma_rad,
+            ceiling=config.ceiling,
             n_threads=_N_THREADS,
         )
         return Estimator(self.model, config.covariance_mode, settings, self.pipeline)

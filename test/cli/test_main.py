@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from cello3d_ros.cli.main import VERBS, main
+from cello3d_ros.config import IcpConfig, Pipeline
 from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.geometry.se3 import exp, inverse, transform
 
@@ -33,15 +34,15 @@ def test_estimate_prints_the_pose_and_both_covariances(files, capsys):
     answer = json.loads(capsys.readouterr().out)
     T = np.reshape(answer["T_ref_read"], (4, 4))
     np.testing.assert_allclose(T, T_TRUE, atol=0.03)
-    Y = np.reshape(answer["covariance_reading"], (6, 6))
-    C = np.reshape(answer["covariance"], (6, 6))
+    Y = np.reshape(answer["covariance"], (6, 6))
+    C = np.reshape(answer["covariance_ros"], (6, 6))
     R = T[:3, :3]
     np.testing.assert_allclose(C[:3, :3], R @ Y[:3, :3] @ R.T, rtol=1e-9, atol=1e-18)
     np.testing.assert_allclose(C[3:, 3:], R @ Y[3:, 3:] @ R.T, rtol=1e-9, atol=1e-18)
     assert (np.linalg.eigvalsh(C) > 0).all()
-    assert answer["converged"] is True
-    assert answer["iterations"] > 0
-    assert 0.5 < answer["overlap_ratio"] <= 1.0
+    assert answer["trust"]["converged"] is True
+    assert answer["registration"]["n_iterations"] > 0
+    assert 0.5 < answer["trust"]["overlap"] <= 1.0
     assert answer["nearest_rho"] >= 0.0
     assert answer["effective_neighbors"] == 1.0
 
@@ -52,9 +53,19 @@ def test_estimate_is_by_the_method_that_is_named(files, capsys):
         assert main(["estimate", *files, "--json", "--method", method]) == 0
         answer = json.loads(capsys.readouterr().out)
         assert answer["method"] == method
-        assert 0.0 <= answer["novelty"] <= 1.0
+        assert 0.0 <= answer["trust"]["novelty"] <= 1.0
         sizes[method] = np.trace(np.reshape(answer["covariance"], (6, 6)))
     assert len(set(sizes.values())) == 3
+
+
+def test_a_registration_that_did_not_converge_is_an_error(files, capsys, tmp_path):
+    hasty = Pipeline(icp=IcpConfig(max_iterations=1))
+    model = constant_model(3.0 * np.eye(6), 704, shape="sandwich", pipeline=hasty)
+    save_model(model, tmp_path / "model.npz")
+    assert main(["estimate", *files]) == 1
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "ICP did not converge in 1 iterations" in output.err
 
 
 def test_estimate_is_readable_and_repeats_itself(files, capsys):
@@ -102,7 +113,7 @@ def test_clouds_with_too_few_points_are_one_sentence(files, capsys, points):
     np.save(files[0], points)
     assert main(["estimate", *files]) == 1
     error = capsys.readouterr().err
-    assert "reading.npy" in error
+    assert "reading" in error
     assert error.count("\n") == 1
 
 

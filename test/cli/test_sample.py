@@ -116,7 +116,7 @@ def test_a_model_trained_on_samples_estimates(tmp_path, recordings, capsys):
     scans = [f"{recordings[0]}/velodyne/00000{k}.bin" for k in (1, 0)]
     assert main(["estimate", *scans, "--model", model, "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
-    Y = np.reshape(answer["covariance_reading"], (6, 6))
+    Y = np.reshape(answer["covariance"], (6, 6))
     assert (np.linalg.eigvalsh(Y) > 0).all()
     assert 1e-4 < np.sqrt(Y[0, 0]) < 0.1
     np.testing.assert_allclose(
