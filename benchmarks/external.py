@@ -64,7 +64,7 @@ def run(steps: Iterator[tuple[Scan, Place]], tracker: Tracker) -> dict[str, Any]
             continue
         if answer is not None:
             T_true = se3.inverse(before[answer.reference_ns]) @ scan.T_world_sensor
-            T_hat = answer.estimate.registration.T_ref_read
+            T_hat = answer.step.T
             answers.append((answer, se3.log(se3.inverse(T_true) @ T_hat)))
     return figures(answers) | {"failures": failures}
 
@@ -72,7 +72,7 @@ def run(steps: Iterator[tuple[Scan, Place]], tracker: Tracker) -> dict[str, Any]
 def figures(answers: list[tuple[Answer, np.ndarray]]) -> dict[str, Any]:
     """Return errors and how they compare with the covariances."""
     xi = np.array([error for _, error in answers])
-    Y = np.array([answer.estimate.covariance for answer, _ in answers])
+    Y = np.array([answer.step.Y for answer, _ in answers])
     D2 = mahalanobis(xi, Y) ** 2
     sigma = np.sqrt(np.linalg.eigvalsh(Y[:, :3, :3])[:, -1])
     return {

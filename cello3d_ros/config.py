@@ -170,11 +170,9 @@ class TrainingConfig(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class NodeConfig(Section):
-    """What only the node needs."""
+class InputConfig(Section):
+    """What the node hears, and where and when the sensor is."""
 
-    model: str = _setting("", "model file or name of a shipped one; empty is general")
-    autostart: bool = _setting(True, "configure and activate at once; false waits to be told")
     T_base_sensor: tuple[float, ...] = _setting(
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
         "sensor in the odometry's child frame: x y z qx qy qz qw",
@@ -183,11 +181,33 @@ class NodeConfig(Section):
         False, "take the sensor in the odometry's child frame from /tf, not from T_base_sensor"
     )
     base_frame: str = _setting("base_link", "the child frame of odometry that names none")
-    output_frame: str = _setting(
-        "sensor",
-        "whose motion is published: the sensor's or the odometry's child frame's",
-        choices=("sensor", "base"),
+    registration: str = _setting(
+        "icp",
+        "who registers: this node, or another program (external_odometry or external_pose)",
+        choices=("icp", "external"),
     )
+    external_tolerance_s: float = _setting(
+        1e-3, "largest distance in time of an external pose and its cloud", 0.0, 1.0
+    )
+    guess_without_odometry: str = _setting(
+        "skip",
+        "what to do with a cloud for which no odometry came in time",
+        choices=("skip", "constant_velocity", "extrapolate"),
+    )
+    max_extrapolation_s: float = _setting(0.5, "odometry is not extrapolated farther", 0.0, 60.0)
+    max_odometry_speed_m_s: float = _setting(
+        50.0, "odometry that moves faster has jumped: the chain starts again", 1e-3
+    )
+    odometry_timeout_s: float = _setting(0.5, "wait for odometry after a cloud's stamp", 0.0, 60.0)
+    odometry_gap_s: float = _setting(1.0, "odometry farther apart is not interpolated", 0.0)
+    odometry_buffer_s: float = _setting(10.0, "odometry remembered", 0.1, 3600.0)
+    future_tolerance_s: float = _setting(0.5, "a cloud stamped later than now + this", 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairingConfig(Section):
+    """What a scan is registered to, and when an answer is none."""
+
     pairing: str = _setting(
         "consecutive",
         "what a cloud is registered to: the one before, a keyframe, or the topic reference_points",
@@ -204,32 +224,18 @@ class NodeConfig(Section):
     max_reference_points: int = _setting(
         50_000, "more points of them are thinned out", 1000, 10_000_000
     )
-    registration: str = _setting(
-        "icp",
-        "who registers: this node, or another program (external_odometry or external_pose)",
-        choices=("icp", "external"),
-    )
-    external_tolerance_s: float = _setting(
-        1e-3, "largest distance in time of an external pose and its cloud", 0.0, 1.0
-    )
     max_external_offset: float = _setting(
         0.5, "an external pose that ICP would move farther (m, rad) is refused; 0 is no look", 0.0
     )
-    guess_without_odometry: str = _setting(
-        "skip",
-        "what to do with a cloud for which no odometry came in time",
-        choices=("skip", "constant_velocity", "extrapolate"),
-    )
-    max_extrapolation_s: float = _setting(0.5, "odometry is not extrapolated farther", 0.0, 60.0)
-    max_odometry_speed_m_s: float = _setting(
-        50.0, "odometry that moves faster has jumped: the chain starts again", 1e-3
-    )
-    odometry_timeout_s: float = _setting(0.5, "wait for odometry after a cloud's stamp", 0.0, 60.0)
-    odometry_gap_s: float = _setting(1.0, "odometry farther apart is not interpolated", 0.0)
-    odometry_buffer_s: float = _setting(10.0, "odometry remembered", 0.1, 3600.0)
     max_pair_gap_s: float = _setting(10.0, "scans farther apart are not paired", 0.0)
     max_failures: int = _setting(3, "failed pairs before the reference is given up", 1)
-    future_tolerance_s: float = _setting(0.5, "a cloud stamped later than now + this", 0.0)
+    seed: int = _setting(0, "seed of the random subsamples", 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CovarianceConfig(Section):
+    """What says how far a registration is to be trusted."""
+
     covariance_mode: str = _setting(
         "cello3d",
         "what says how far a registration is to be trusted",
@@ -249,6 +255,17 @@ class NodeConfig(Section):
     inflate_unknown: bool = _setting(
         True, "widen the model's prediction for an unknown pair to the mean of its examples"
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputConfig(Section):
+    """What the node publishes."""
+
+    output_frame: str = _setting(
+        "sensor",
+        "whose motion is published: the sensor's or the odometry's child frame's",
+        choices=("sensor", "base"),
+    )
     warn_sigma_m: float = _setting(0.3, "3 sigma along the weakest axis that warns", 0.0)
     error_sigma_m: float = _setting(1.0, "3 sigma along the weakest axis that is an error", 0.0)
     floor_sigma_m: float = _setting(1e-4, "smallest published standard deviation", 1e-9)
@@ -257,7 +274,14 @@ class NodeConfig(Section):
     marker_scale: float = _setting(1.0, "~/markers are drawn this many times as large", 1e-3, 1e6)
     marker_lifetime_s: float = _setting(10.0, "~/markers vanish after this; 0 is never", 0.0)
     publish_tf: bool = _setting(False, "publish ~/pose on /tf as well; needs tf2_msgs")
-    seed: int = _setting(0, "seed of the random subsamples", 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeConfig(OutputConfig, CovarianceConfig, PairingConfig, InputConfig):
+    """What only the node needs."""
+
+    model: str = _setting("", "model file or name of a shipped one; empty is general")
+    autostart: bool = _setting(True, "configure and activate at once; false waits to be told")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -15,6 +15,7 @@ from cello3d_ros.errors import RecordingError
 
 if TYPE_CHECKING:
     from cello3d_ros.config import NodeConfig
+    from cello3d_ros.geometry.gaussian import GaussianPose
     from cello3d_ros.geometry.se3 import Array
     from cello3d_ros.tracking.offline import Step
     from cello3d_ros.tracking.tracker import Answer
@@ -100,39 +101,38 @@ def _recorded(
             failure = {"stamp_ns": stamp_ns, "reason": step.reason, "sentence": step.sentence}
             lines.write(json.dumps(failure) + "\n")
             continue
-        T_ref_read = answer.estimate.registration.T_ref_read
-        C = _published(answer.estimate.covariance, T_ref_read, config)
-        C_chain = _published(answer.Y_chain, answer.T_odom_read, config)
-        poses.write(tum_line(stamp_ns, answer.T_odom_read))
+        C, C_chain = _published(answer.step, config), _published(answer.pose, config)
+        poses.write(tum_line(stamp_ns, answer.pose.T))
         lines.write(json.dumps(_as_dict(answer)) + "\n")
         yield (
             f"{_PREFIX}/relative_pose",
             stamp_ns,
-            make.pose_with_covariance(T_ref_read, C, stamp_ns, answer.frame_id),
+            make.pose_with_covariance(answer.step.T, C, stamp_ns, answer.frame_id),
         )
         yield (
             f"{_PREFIX}/pose",
             stamp_ns,
-            make.pose_with_covariance(answer.T_odom_read, C_chain, stamp_ns, answer.pose_frame_id),
+            make.pose_with_covariance(answer.pose.T, C_chain, stamp_ns, answer.pose_frame_id),
         )
 
 
-def _published(Y: Array, T: Array, config: NodeConfig) -> Array:
+def _published(pose: GaussianPose, config: NodeConfig) -> Array:
     from cello3d_ros.tracking.covariances import ros_covariance
 
-    return ros_covariance(
-        Y, T[:3, :3], config.floor_sigma_m, config.floor_sigma_rad, config.ceiling
-    )
+    bounds = config.floor_sigma_m, config.floor_sigma_rad, config.ceiling
+    return ros_covariance(pose.Y, pose.T[:3, :3], *bounds)
 
 
 def _as_dict(answer: Answer) -> dict[str, Any]:
     """Return an answer as plain numbers under the names that they have in Python."""
+    found, step = answer.estimate, answer.step
+    registration = found.registration._replace(T_ref_read=step.T)  # as it is published
     return {
         "stamp_ns": answer.stamp_ns,
         "reference_ns": answer.reference_ns,
-        **answer.estimate.to_dict(),
-        "T_odom_read": answer.T_odom_read.ravel().tolist(),
-        "Y_chain": answer.Y_chain.ravel().tolist(),
+        **found._replace(registration=registration, covariance=step.Y).to_dict(),
+        "T_odom_read": answer.pose.T.ravel().tolist(),
+        "Y_chain": answer.pose.Y.ravel().tolist(),
     }
 
 

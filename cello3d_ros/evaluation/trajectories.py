@@ -18,8 +18,7 @@ from cello3d_ros.errors import RegistrationError
 from cello3d_ros.evaluation.result import Consistency, Distances, Paths
 from cello3d_ros.geometry.gaussian import (
     GaussianPose,
-    compound_right,
-    is_positive_definite,
+    extended,
     mahalanobis,
 )
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log
@@ -92,16 +91,10 @@ def compound_chain(steps: Sequence[GaussianPose]) -> GaussianPose:
 
 
 def compound_path(steps: Sequence[GaussianPose]) -> list[GaussianPose]:
-    """Return the pose after each step, right covariance, to 4th order.
-
-    Where the 4th order is not positive definite (spread of a radian) a step is of 2nd order.
-    """
+    """Return the pose after each step, right covariance (``extended``)."""
     path = [steps[0]]
     for step in steps[1:]:
-        longer = compound_right(*path[-1], *step)
-        if not is_positive_definite(longer.Y):
-            longer = compound_right(*path[-1], *step, order=2)
-        path.append(longer)
+        path.append(extended(path[-1], step))
     return path
 
 

@@ -101,7 +101,7 @@ class CovarianceNode(ManagedNode):
         self.active.callback(self._worker.stop)
         self._came: set[Role] = set()
         self._patient_until_s: float | None = None
-        self._cloud_number: int | None = None
+        self._last_cloud: tuple[Any, int | None] = None, None  # its publisher and number
         self._work_is_there = self.create_guard_condition(self._work_when_quiet)
         self.active.callback(self.destroy_guard_condition, self._work_is_there)
         timer = self.create_timer(_TICK_S, self._expire, clock=self._steady)
@@ -176,15 +176,16 @@ class CovarianceNode(ManagedNode):
     def _n_unheard(self, info: dict[str, Any]) -> int:
         """Return how many clouds of this publisher came since the last and never got here.
 
-        Several publishers count each for itself, and nobody says whose a cloud is: then 0.
+        Each publisher counts for itself, and nobody says whose a cloud is: 0 unless there is one,
+        and the same as before.
         """
-        before, self._cloud_number = self._cloud_number, info.get("publication_sequence_number")
-        if before is None or self._cloud_number is None or self._n_cloud_publishers() != 1:
+        publishers = self.get_publishers_info_by_topic(self.resolve_topic_name("points"))
+        only = tuple(publishers[0].endpoint_gid) if len(publishers) == 1 else None
+        number = info.get("publication_sequence_number")
+        (publisher, before), self._last_cloud = self._last_cloud, (only, number)
+        if only is None or publisher != only or before is None or number is None:
             return 0
-        return max(0, int(self._cloud_number) - before - 1)
-
-    def _n_cloud_publishers(self) -> int:
-        return int(self.count_publishers(self.resolve_topic_name("points")))
+        return max(0, int(number) - before - 1)
 
     def _expire(self) -> None:
         self._worker.expire(_TICK_S)
@@ -231,14 +232,22 @@ class CovarianceNode(ManagedNode):
         except Cello3dError as error:
             self._skip(Skip(job.stamp_ns, error.reason, str(error)))
         except Exception as error:  # a node that dies of one cloud is worse than a lost answer
-            if not self.context.ok():
-                raise
-            self.get_logger().error(traceback.format_exc())
+            self._outlive()
             self._skip(Skip(job.stamp_ns, "internal", f"{type(error).__name__}: {error}"))
         self._publish_diagnostics()
-        self._worker.finish()
+        try:
+            self._worker.finish()
+        except Exception:  # the cloud is answered; as a reference it is of no use
+            self._outlive()
+            self._worker.reset()
         if self._worker.has_work:
             self._work_is_there.trigger()
+
+    def _outlive(self) -> None:
+        """Log the exception that is being handled; raise it again where the node has to end."""
+        if not self.context.ok():
+            raise
+        self.get_logger().error(traceback.format_exc())
 
     def _publish(self, job: Job, answer: Answer) -> None:
         assert self._config is not None

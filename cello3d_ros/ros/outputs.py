@@ -9,6 +9,7 @@ from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
 from cello3d_ros.config import NodeConfig
+from cello3d_ros.geometry.gaussian import GaussianPose
 from cello3d_ros.geometry.se3 import Array, log
 from cello3d_ros.ros import messages
 from cello3d_ros.ros.diagnostics import Verdict, judged
@@ -45,21 +46,17 @@ class Outputs:
 
         Raises CovarianceError and publishes nothing when there is one that cannot be.
         """
-        found = answer.estimate
-        T_ref_read = found.registration.T_ref_read
-        relative = _pose(job.stamp_ns, answer.frame_id, T_ref_read, found.covariance, config)
-        pose = _pose(
-            job.stamp_ns, answer.pose_frame_id, answer.T_odom_read, answer.Y_chain, config
-        )
+        relative = _pose(job.stamp_ns, answer.frame_id, answer.step, config)
+        pose = _pose(job.stamp_ns, answer.pose_frame_id, answer.pose, config)
         odometry = messages.full_odometry(pose, answer.child_frame_id, *_twist(answer, config))
         C: Array = relative.pose.covariance.reshape(6, 6)
-        verdict = judged(C, found, config)
+        verdict = judged(C, answer.estimate, config)
         self._odometry.publish(odometry)
         self._relative.publish(relative)
         self._pose.publish(pose)
         if self._tf_message is not None:
             T = messages.transform_to(
-                job.stamp_ns, answer.pose_frame_id, answer.child_frame_id, answer.T_odom_read
+                job.stamp_ns, answer.pose_frame_id, answer.child_frame_id, answer.pose.T
             )
             self._tf.publish(self._tf_message(transforms=[T]))
         if self._markers.get_subscription_count() > 0:
@@ -74,8 +71,8 @@ class Outputs:
         verdict: Verdict,
         config: NodeConfig,
     ) -> MarkerArray:
-        T = answer.T_odom_read
-        C_step = messages.ros_covariance(answer.estimate.covariance, T[:3, :3], *_bounds(config))
+        T = answer.pose.T
+        C_step = messages.ros_covariance(answer.step.Y, T[:3, :3], *_bounds(config))
         return markers_to(
             answer.stamp_ns,
             pose.header.frame_id,
@@ -90,11 +87,11 @@ class Outputs:
 
 
 def _pose(
-    stamp_ns: int, frame_id: str, T: Array, Y: Array, config: NodeConfig
+    stamp_ns: int, frame_id: str, pose: GaussianPose, config: NodeConfig
 ) -> PoseWithCovarianceStamped:
     """Return the message of a pose with its reading-side covariance within the bounds."""
-    C = messages.ros_covariance(Y, T[:3, :3], *_bounds(config))
-    return messages.pose_with_covariance(stamp_ns, frame_id, T, C)
+    C = messages.ros_covariance(pose.Y, pose.T[:3, :3], *_bounds(config))
+    return messages.pose_with_covariance(stamp_ns, frame_id, pose.T, C)
 
 
 def _twist(answer: Answer, config: NodeConfig) -> tuple[Array, Array]:
@@ -102,12 +99,10 @@ def _twist(answer: Answer, config: NodeConfig) -> tuple[Array, Array]:
 
     Zero with the largest covariance where the reference is no scan shortly before: unknown.
     """
-    dt_s = 1e-9 * (answer.stamp_ns - answer.reference_ns)
-    if config.pairing == "topics" or not 0.0 < dt_s <= config.max_pair_gap_s:
+    if answer.span_s is None:
         return np.zeros(6), config.ceiling * np.eye(6)
-    found = answer.estimate
-    C = twist_covariance(found.covariance, dt_s, *_bounds(config))
-    return log(found.registration.T_ref_read) / dt_s, C
+    C = twist_covariance(answer.step.Y, answer.span_s, *_bounds(config))
+    return log(answer.step.T) / answer.span_s, C
 
 
 def _bounds(config: NodeConfig) -> tuple[float, float, float]:

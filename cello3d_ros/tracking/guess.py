@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cello3d_ros.config import NodeConfig
+from cello3d_ros.config import InputConfig
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.pose_track import PoseError, PoseNotYetError
 from cello3d_ros.geometry.se3 import Array
@@ -44,7 +44,7 @@ class Locator:
     """Says where the sensor is, from odometry or the external registration and the extrinsic."""
 
     def __init__(
-        self, config: NodeConfig, source: PoseSource, transforms: TransformTree | None = None
+        self, config: InputConfig, source: PoseSource, transforms: TransformTree | None = None
     ) -> None:
         """source: odometry or external poses.  transforms: /tf, or None for T_base_sensor."""
         self.config = config
@@ -104,25 +104,3 @@ class Locator:
         if odom_frame == self.map_frame or self.transforms is None:
             return None
         return self.transforms.at(self.map_frame, odom_frame, stamp_ns)
-
-
-class Motion:
-    """The last two poses of a chain, carried on at constant velocity."""
-
-    def __init__(self) -> None:
-        self._last: tuple[int, Array] | None = None
-        self._velocity = np.zeros(6)
-
-    def add(self, stamp_ns: int, T: Array) -> None:
-        """Remember the next pose (4, 4) of the chain."""
-        if self._last is not None and stamp_ns > self._last[0]:
-            span_s = 1e-9 * (stamp_ns - self._last[0])
-            self._velocity = se3.log(se3.inverse(self._last[1]) @ T) / span_s
-        self._last = (stamp_ns, T)
-
-    def at(self, stamp_ns: int) -> Array:
-        """Return the pose ``T_last exp(dt v)``; the last one of one, identity of none.  (4, 4)."""
-        if self._last is None:
-            return np.eye(4)
-        dt_s = 1e-9 * (stamp_ns - self._last[0])
-        return np.asarray(self._last[1] @ se3.exp(dt_s * self._velocity))

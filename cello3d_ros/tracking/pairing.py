@@ -1,47 +1,130 @@
-"""What a cloud is registered to: a scan of the chain, or a map.  Imports no ROS."""
+"""What a scan is registered to: the one before, a keyframe or a map.  Imports no ROS."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 
-from cello3d_ros.clouds.filters import crop_range, limit_density, subsample
-from cello3d_ros.clouds.shape import Cloud, prepare
-from cello3d_ros.config import CloudConfig, NodeConfig
-from cello3d_ros.errors import CloudError, NoOverlapError
+from cello3d_ros.config import CloudConfig, PairingConfig
+from cello3d_ros.covariance.estimator import Estimate
+from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.gaussian import GaussianPose
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.tracking.guess import Place
+from cello3d_ros.tracking.chain import Chain, Frame, Link
+from cello3d_ros.tracking.guess import ODOMETRY
+from cello3d_ros.tracking.map import Map
 
-_MOVED = 0.25  # share of the range after which the map is cropped anew
-_SPARE = 10  # of so many times the points that are kept density is made even
+
+class NoReferenceError(RegistrationError):
+    """No reference cloud has come."""
+
+    reason = "no_reference"
 
 
-@dataclass(frozen=True)
-class Frame:
-    """A filtered scan and where its sensor was; its local shape is found when it is needed.
+class Consecutive:
+    """Each scan is registered to the one answered before it."""
 
-    T_odom_sensor: (4, 4), in the frame of the odometry, as it says or, without it, as the
-    registration made of it; None when there has been no odometry since the chain began.
+    map_frame = ""  # the frame that answers are in where the reference is a map
+    needs_chain = True  # whether a pause or a break of the odometry leaves nothing to register to
+
+    def __init__(self) -> None:
+        self._reference: Link | None = None
+
+    @property
+    def next_reference(self) -> Frame | None:
+        """The scan that the next one will be registered to, where that is known already."""
+        return None if self._reference is None else self._reference.frame
+
+    def begin(self, link: Link | None) -> None:
+        """Start a chain with a scan, or forget the one there is."""
+        self._reference = link
+
+    def reference(
+        self, frame: Frame, chain: Chain, config: PairingConfig, clouds: CloudConfig
+    ) -> Link | None:
+        """Return what a scan is registered to; None: it starts a chain."""
+        return self._reference
+
+    def accept(self, link: Link, found: Estimate, config: PairingConfig) -> None:
+        """Note an answered scan."""
+        self._reference = link
+
+    def fail(self, chain: Chain) -> None:
+        """Note a scan that did not fit."""
+        self._reference = chain.newest
+
+
+class Keyframe(Consecutive):
+    """Each scan is registered to a keyframe, until it is far from it or did not fit it."""
+
+    def accept(self, link: Link, found: Estimate, config: PairingConfig) -> None:
+        """Note an answered scan; one far enough from the keyframe is the next keyframe."""
+        if makes_keyframe(found.registration.T_ref_read, found.overlap_ratio, config):
+            self._reference = link
+
+
+class ToMap(Consecutive):
+    """Each scan is registered to the part of a map around it.
+
+    Where the odometry is in the map is said by /tf or else by the last answer; until there is
+    one, the two are taken to coincide.
     """
 
-    stamp_ns: int
-    cloud: Cloud
-    place: Place
-    T_odom_sensor: Array | None
+    needs_chain = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._map: Map | None = None
+        self._T_map_odom: Array = np.eye(4)
+
+    @property
+    def map_frame(self) -> str:  # type: ignore[override]
+        """The frame of the map."""
+        return "" if self._map is None else self._map.frame_id
+
+    def take(self, new: Map) -> bool:
+        """Take another map; return whether its frame is another, too.  One like it is ignored."""
+        is_other = self._map is None or self._map.frame_id != new.frame_id
+        if is_other or self._map is None or not self._map.is_same(new):
+            self._map = new
+        return is_other
+
+    def begin(self, link: Link | None) -> None:
+        """Forget where the odometry is in the map."""
+        self._T_map_odom = np.eye(4)
+
+    def reference(
+        self, frame: Frame, chain: Chain, config: PairingConfig, clouds: CloudConfig
+    ) -> Link | None:
+        """Return the part of the map around the first guess of the sensor."""
+        if self._map is None:
+            raise NoReferenceError("no cloud has been received on reference_points")
+        given = frame.place.T_map_odom
+        T_map_odom = self._T_map_odom if given is None else given
+        if frame.T_odom_sensor is None:
+            T_map_sensor = chain.predicted(frame.stamp_ns)
+        else:
+            T_map_sensor = T_map_odom @ frame.T_odom_sensor
+        cloud, T_map_crop = self._map.around(T_map_sensor[:3, 3], config, clouds)
+        T_odom_crop = se3.inverse(T_map_odom) @ T_map_crop
+        crop = Frame(self._map.stamp_ns, cloud, frame.place, T_odom_crop)
+        return Link(crop, GaussianPose(T_map_crop, np.zeros((6, 6))))
+
+    def accept(self, link: Link, found: Estimate, config: PairingConfig) -> None:
+        """Note where an answered scan puts the odometry in the map."""
+        place = link.frame.place
+        if place.guess == ODOMETRY and place.T_odom_sensor is not None:
+            self._T_map_odom = link.pose.T @ se3.inverse(place.T_odom_sensor)
+
+    def fail(self, chain: Chain) -> None:
+        """The map stays."""
 
 
-@dataclass(frozen=True)
-class Link:
-    """A frame that is part of the chain.  T: (4, 4), its accumulated pose; Y: (6, 6), right."""
-
-    frame: Frame
-    T: Array
-    Y: Array
+#: Policies by ``node.pairing``.
+PAIRINGS = {"consecutive": Consecutive, "keyframe": Keyframe, "topics": ToMap}
 
 
-def makes_keyframe(T_ref_read: Array, overlap_ratio: float, config: NodeConfig) -> bool:
+def makes_keyframe(T_ref_read: Array, overlap_ratio: float, config: PairingConfig) -> bool:
     """Return whether a registered scan is far enough from its keyframe to be the next one."""
     way_m = np.linalg.norm(T_ref_read[:3, 3])
     angle_rad = np.linalg.norm(se3.log(T_ref_read)[3:])
@@ -50,58 +133,3 @@ def makes_keyframe(T_ref_read: Array, overlap_ratio: float, config: NodeConfig) 
         or angle_rad > config.keyframe_angle_rad
         or overlap_ratio < config.keyframe_min_overlap
     )
-
-
-class Map:
-    """A cloud that stays; what lies around the sensor is prepared once and kept for a while."""
-
-    def __init__(self, stamp_ns: int, points: Array, frame_id: str) -> None:
-        """points: (N, 3), in the frame ``frame_id``."""
-        self.stamp_ns, self.points, self.frame_id = stamp_ns, points, frame_id
-        self._cloud: Cloud | None = None
-        self._centre = np.zeros(3)
-        self._made_with: tuple[float, int, CloudConfig, int] | None = None
-
-    def is_same(self, other: Map) -> bool:
-        """Return whether another message says the same."""
-        mine, theirs = ((m.stamp_ns, m.frame_id, m.points.shape) for m in (self, other))
-        return mine == theirs and np.array_equal(self.points, other.points)
-
-    def around(
-        self, position: Array, node: NodeConfig, config: CloudConfig
-    ) -> tuple[Cloud, Array]:
-        """Return the prepared points around a position and T_map_crop, the frame they are in.
-
-        That frame has the axes of the map and its origin at a place at most a quarter of
-        ``reference_range_m`` from the position.  position: (3,).  Raises NoOverlapError.
-        """
-        range_m, n_points = node.reference_range_m, node.max_reference_points
-        made_with = (range_m, n_points, config, node.seed)
-        moved_m = np.linalg.norm(position - self._centre)
-        if self._cloud is None or moved_m > _MOVED * range_m or made_with != self._made_with:
-            self._cloud = None
-            rng = np.random.default_rng([node.seed, self.stamp_ns & (2**64 - 1)])
-            self._cloud = self._prepared(position, range_m, n_points, config, rng)
-            self._centre, self._made_with = np.array(position), made_with
-        return self._cloud, se3.pose(self._centre, [0.0, 0.0, 0.0, 1.0])
-
-    def _prepared(
-        self,
-        centre: Array,
-        range_m: float,
-        n_points: int,
-        config: CloudConfig,
-        rng: np.random.Generator,
-    ) -> Cloud:
-        """Return what is within range of a centre, even in density and no more than that many."""
-        low, high = centre - range_m, centre + range_m
-        near = self.points[((self.points >= low) & (self.points <= high)).all(axis=1)] - centre
-        near = crop_range(near[subsample(len(near), _SPARE * n_points, rng)], 0.0, range_m)
-        even = limit_density(near, config.voxel_m, config.max_points_per_voxel, rng)
-        few = even[subsample(len(even), n_points, rng)]
-        try:
-            return prepare(few, replace(config, min_range_m=0.0, max_range_m=range_m), rng)
-        except CloudError as error:
-            raise NoOverlapError(
-                f"the reference cloud around the guess of the sensor is too small: {error}"
-            ) from None

@@ -7,6 +7,12 @@ import pytest
 
 from cello3d_ros.geometry import gaussian as g
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.gaussian import (
+    GaussianPose,
+    extended,
+    is_positive_definite,
+    mahalanobis,
+)
 from cello3d_ros.geometry.se3 import Array
 
 EYE = np.eye(6)
@@ -386,3 +392,35 @@ def test_arguments_stay_as_they_were() -> None:
     g.kl(Ya, Yb), g.mahalanobis(xi, Ya), g.sampled_covariance(xi, xi[0]), g.matrix_sqrt(Ya)
     for array, copy in zip((A, B, Ya, Yb, xi), before, strict=True):
         np.testing.assert_array_equal(array, copy)
+
+
+STRAIGHT, CURVE = [0.5, 0, 0, 0, 0, 0], [0.3, 0.1, 0, 0.1, 0.2, 0.6]
+
+
+@pytest.mark.parametrize("motion", [STRAIGHT, CURVE])
+@pytest.mark.parametrize("turn_rad", [0.03, 0.1, 0.3])
+def test_a_long_chain_covers_sampled_chains(motion: list[float], turn_rad: float) -> None:
+    """80 steps: right to 5 % while rotation is known to a radian, never too small beyond.
+
+    A chain that falls back to the 2nd order at a radian claims 1/45 of the squared error here.
+    """
+    rng = np.random.default_rng(0)
+    step = GaussianPose(se3.exp(motion), np.diag(np.repeat([0.02**2, turn_rad**2], 3)))
+    chain, T_true, n = GaussianPose(np.eye(4), np.zeros((6, 6))), np.eye(4), 4000
+    T = np.tile(np.eye(4), (n, 1, 1))
+    for _ in range(80):
+        chain, T_true = extended(chain, step), T_true @ step.T
+        noise = rng.normal(size=(n, 6)) * np.sqrt(np.diag(step.Y))
+        T = T @ step.T @ se3.exp(noise)
+    assert is_positive_definite(chain.Y)
+    share = np.mean(mahalanobis(se3.log(se3.inverse(T_true) @ T), chain.Y) ** 2) / 6
+    assert 0.95 < share < 1.05 if turn_rad < 0.2 else 0.2 < share < 1.05
+
+
+@pytest.mark.parametrize("scale", [1e-6, 0.3, 1.0, 1e3, 1e12])
+def test_a_chain_stays_finite_and_never_knows_more_than_its_steps_together(scale: float) -> None:
+    chain = GaussianPose(np.eye(4), np.zeros((6, 6)))
+    for _ in range(400):
+        chain = extended(chain, GaussianPose(np.eye(4), scale * np.eye(6)))
+    assert is_positive_definite(chain.Y)
+    assert min(399 * scale, 0.99e12) < chain.Y[0, 0] <= 1.01e12

@@ -17,6 +17,7 @@ from cello3d_ros.errors import (
     RegistrationError,
 )
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.gaussian import GaussianPose
 from cello3d_ros.registration.icp import Registration
 from cello3d_ros.ros.diagnostics import ERROR, OK, WARN, Statistics, Verdict, judged
 from cello3d_ros.tracking.tracker import Answer
@@ -47,7 +48,8 @@ def an_estimate(C: np.ndarray, **flags: bool) -> Estimate:
 def answered(statistics: Statistics, C: np.ndarray, **settings) -> None:
     config = NodeConfig(max_failures=3, **settings)
     found = an_estimate(C)
-    answer = Answer(2, 1, found, np.eye(4), C, offset=np.zeros(6))
+    pose = GaussianPose(np.eye(4), C)
+    answer = Answer(2, 1, found, pose, pose, offset=np.zeros(6))
     statistics.answer(answer, C, judged(C, found, config), 0.0, 3)
 
 

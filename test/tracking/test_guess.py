@@ -9,7 +9,7 @@ from cello3d_ros.config import NodeConfig
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.pose_track import PoseMissingError, PoseNotYetError, PoseTrack
 from cello3d_ros.geometry.transforms import TransformTree, UnknownFrameError
-from cello3d_ros.tracking.guess import Locator, Motion
+from cello3d_ros.tracking.guess import Locator
 from cello3d_ros.tracking.odometry import PoseSource
 
 S = 10**9
@@ -117,16 +117,6 @@ def test_an_external_pose_must_be_in_the_frame_of_the_map() -> None:
         where.place(S, "lidar", False)
     where.map_frame = "odom"
     assert where.place(S, "lidar", False).guess == "external"
-
-
-def test_motion_is_carried_on_at_constant_velocity() -> None:
-    motion = Motion()
-    np.testing.assert_array_equal(motion.at(S), np.eye(4))
-    motion.add(S, X)
-    np.testing.assert_array_equal(motion.at(5 * S), X)
-    motion.add(2 * S, X @ STEP)
-    expected = X @ STEP @ STEP @ STEP
-    np.testing.assert_allclose(motion.at(4 * S), expected, atol=1e-12)
 
 
 def _hear(transforms: TransformTree, parent: str, child: str, T: np.ndarray) -> None:

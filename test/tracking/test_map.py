@@ -6,7 +6,7 @@ import pytest
 from cello3d_ros.config import CloudConfig, NodeConfig
 from cello3d_ros.errors import NoOverlapError
 from cello3d_ros.geometry import se3
-from cello3d_ros.tracking.pairing import Map
+from cello3d_ros.tracking.map import Map
 
 PLAIN, NODE, NARROW = CloudConfig(), NodeConfig(), NodeConfig(reference_range_m=40.0)
 

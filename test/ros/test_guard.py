@@ -1,0 +1,80 @@
+"""What goes wrong outside of a registration costs a cloud or a reference, never the node."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace as Info
+
+import numpy as np
+import pytest
+import rclpy
+
+from cello3d_ros.geometry import se3
+from cello3d_ros.ros import messages
+from cello3d_ros.ros.node import CovarianceNode
+from cello3d_ros.tracking.warmup import room
+
+S = 1_000_000_000
+
+
+@pytest.fixture
+def node(model_path: Path) -> Iterator[CovarianceNode]:
+    """An active node in this process, which hears by its own methods."""
+    rclpy.init(args=["--ros-args", "-p", f"node.model:={model_path}", "--log-level", "fatal"])
+    node = CovarianceNode("guarded")
+    node.start()
+    yield node
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def hear(node: CovarianceNode, k: int) -> None:
+    """Let a node hear the odometry and the cloud of the step k, and work."""
+    T = se3.exp([0.1 * k, 0, 0, 0, 0, 0.02 * k])
+    points = se3.transform(se3.inverse(T), room(np.random.default_rng(k)))
+    node._on_pose(messages.odometry_to(S + k * S // 10, "odom", "lidar", T))
+    node._on_cloud(messages.cloud_to(S + k * S // 10, "lidar", points), {})
+    node._work()
+
+
+def test_an_exception_after_an_answer_costs_the_reference_and_not_the_node(
+    node, monkeypatch
+) -> None:
+    for k in range(3):
+        hear(node, k)
+
+    def fail() -> None:
+        raise ZeroDivisionError("unforeseen")
+
+    monkeypatch.setattr(node._worker._tracker, "finish", fail)
+    hear(node, 3)
+    monkeypatch.undo()
+    assert (node._statistics.counts["answered"], sum(node._statistics.dropped.values())) == (3, 0)
+    assert node._worker.n_restarts == 1
+    hear(node, 4)
+    hear(node, 5)
+    assert node._statistics.counts["answered"] == 4
+    assert node._statistics.counts["references"] == 2
+
+
+def publisher(number: int) -> Info:
+    return Info(endpoint_gid=[number, 7])
+
+
+def test_only_clouds_of_one_and_the_same_publisher_are_missed(node, monkeypatch) -> None:
+    """Each publisher numbers its own clouds: another one begins anywhere."""
+    heard: list[int] = []
+    for publishers, number in [
+        ([1], 5),
+        ([1], 6),
+        ([1], 9),  # two were not heard
+        ([2], 400),  # another publisher
+        ([2], 402),  # one was not heard
+        ([2, 3], 900),
+        ([2, 3], 950),
+        ([3], 2),
+        ([3], 3),
+    ]:
+        found = [publisher(k) for k in publishers]
+        monkeypatch.setattr(node, "get_publishers_info_by_topic", lambda _, found=found: found)
+        heard.append(node._n_unheard({"publication_sequence_number": number}))
+    assert heard == [0, 0, 2, 0, 1, 0, 0, 0, 0]
