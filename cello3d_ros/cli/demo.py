@@ -16,7 +16,8 @@ from cello3d_ros.atomic import new_file, new_folder
 from cello3d_ros.cli.sources import add_source_arguments, open_source
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry.gaussian import mahalanobis, to_fixed_axes
-from cello3d_ros.geometry.se3 import Array, inverse, log
+from cello3d_ros.geometry.se3 import Array, inverse, log, transform
+from cello3d_ros.learning.measures import verdict
 from cello3d_ros.recordings import Recording
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from cello3d_ros.ros.replay import Replay
 
 _CHI2_6_95 = 12.591587  # 95 % of a chi-squared distribution of 6 degrees of freedom
+_SLICE_M, _SLICE_POINTS = 1.0, 3000  # of each scan: what the picture shows of the surroundings
 _ROS_IS_MISSING = (
     "the demo needs ROS 2: source /opt/ros/jazzy/setup.bash, or "
     "pip install ros-jazzy-rclpy ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
@@ -80,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         with new_folder(out / "bag", replace=True) as folder:
             write_raw(folder, replay.raw)
-        draw(replay, recording.name, out / "trajectory.png")
+        draw(replay, recording.name, surroundings(replay, recording), out / "trajectory.png")
     print("\n".join(table(summary, recording.name)))
     print(f"\n{out}: summary.json, trajectory.png, bag, node.log")
     if complaint is None and summary["relative_poses"] < summary["pairs_expected"]:
@@ -110,6 +112,7 @@ def judge(replay: Replay, n_pairs: int) -> dict[str, Any]:
         "median_translation_error_m": _or_none(np.median, np.linalg.norm(xi[:, :3], axis=1)),
         "final_translation_error_m": _final_error_m(replay),
         "mean_mahalanobis_6dof": _or_none(np.mean, distances),
+        "mean_d2_over_6": _or_none(np.mean, distances**2 / 6.0),
         "coverage_95": _or_none(np.mean, distances**2 < _CHI2_6_95),
         "min_eigenvalue": min((float(np.linalg.eigvalsh(C)[0]) for C in matrices), default=None),
         "latency_ms": {
@@ -158,10 +161,22 @@ def _final_error_m(replay: Replay) -> float | None:
     return float(np.linalg.norm(T_hat[:3, 3] - T_true[:3, 3]))
 
 
-def draw(replay: Replay, name: str, path: Path) -> None:
-    """Write the top view: ground truth, odometry, the chain of poses with 3-sigma ellipses.
+def surroundings(replay: Replay, recording: Recording) -> Array:
+    """Return (n, 2) points near the sensor's height, from above, placed by the node's poses."""
+    rng, rows = np.random.default_rng(0), [np.empty((0, 2))]
+    for scan in recording:
+        if (pose := replay.poses.get(scan.stamp_ns)) is not None:
+            points = scan.points[np.abs(scan.points[:, 2]) < _SLICE_M]
+            points = points[rng.permutation(len(points))[:_SLICE_POINTS]]
+            rows.append(transform(pose.T, points)[:, :2])
+    return np.vstack(rows)
 
-    Ellipses too small to be seen are drawn 10, 100, ... times as large; the legend says so.
+
+def draw(replay: Replay, name: str, around: Array, path: Path) -> None:
+    """Write the top view: surroundings, truth, odometry, the chain of poses, 3-sigma ellipses.
+
+    around: (n, 2) points in the frame of odometry.  Ellipses too small to be seen are drawn
+    10, 100, ... times as large; the legend says so.
     """
     from matplotlib.figure import Figure
 
@@ -174,6 +189,9 @@ def draw(replay: Replay, name: str, path: Path) -> None:
     icp = np.array([start, *((M @ pose.T)[:2, 3] for pose in poses)])
     figure = Figure(figsize=(8, 8), dpi=120, layout="constrained")
     axes = figure.add_subplot()
+    points = np.column_stack([around, np.zeros(len(around))])
+    axes.plot(*transform(M, points)[:, :2].T, ",", color="0.6", zorder=0)
+    axes.plot([], [], ".", color="0.6", label="surroundings")
     if len(truth):
         axes.plot(*truth.T, color="black", linewidth=4, alpha=0.3, label="ground truth")
     if len(odometry):
@@ -181,7 +199,10 @@ def draw(replay: Replay, name: str, path: Path) -> None:
     axes.plot(*icp.T, color="tab:blue", marker=".", label="ICP (~/pose of the node)")
     B = M[:3, :3]
     _draw_ellipses(axes, icp[1:], [(B @ pose.C[:3, :3] @ B.T)[:2, :2] for pose in poses])
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.plot(*icp[0], "o", color="tab:green", markersize=11, label="start")
+    axes.plot(*icp[-1], "s", color="tab:purple", markersize=11, label="end")
+    center, half = (icp.max(axis=0) + icp.min(axis=0)) / 2, max(1.0, np.ptp(icp, axis=0).max())
+    axes.set(xlim=center[0] + [-half, half], ylim=center[1] + [-half, half], aspect="equal")
     axes.set(xlabel="x in m", ylabel="y in m", title=f"{name}: top view")
     axes.grid(alpha=0.3)
     axes.legend()
@@ -232,6 +253,10 @@ def table(summary: dict[str, Any], name: str) -> Iterator[str]:
     yield f"{name}, model {summary['model'] or 'unknown'}"
     for what, value, note in rows:
         yield f"  {what:24}{value:>14}   {note}".rstrip()
+    if (ratio := summary["mean_d2_over_6"]) is None:
+        yield "Without ground truth nobody can say whether the covariance is right."
+    else:
+        yield f"The covariance is {verdict(ratio)} (D2/6 {ratio:.2g}; 1 is right)."
 
 
 def _replay(
@@ -253,29 +278,41 @@ def _replay(
     given = [word for text in parameters for word in ("-p", text)]
     if arguments.model:
         given += ["-p", f"node.model:={find_model(arguments.model).resolve()}"]
-    with NodeProcess(arguments.out / "node.log", domain_id, ros_arguments=given) as node:
-        player = Player(domain_id, check=node.check)
+    print("Starting covariance_node; its first start compiles for about a minute.", flush=True)
+    with (
+        NodeProcess(arguments.out / "node.log", domain_id, ros_arguments=given) as node,
+        _bar(len(recording)) as bar,
+    ):
+
+        def watch() -> None:
+            node.check()
+            bar.update(0)
+
+        player = Player(domain_id, check=watch)
         try:
-            complaint = _play(player, recording, arguments.rate)
+            complaint = _play(player, recording, arguments.rate, bar)
         finally:
             player.close()
         memory_mb = node.peak_memory_mb
         return player.replay, complaint or _stopped(node), memory_mb
 
 
-def _play(player: Any, recording: Recording, rate_hz: float | None) -> str | None:
-    """Play with a bar on a terminal; return what went wrong, in one sentence."""
+def _bar(n_scans: int) -> Any:
+    """Return a bar of progress whose seconds go on while the node starts."""
     from tqdm import tqdm
 
+    often_s = 0.1 if sys.stdout.isatty() else 5.0
+    return tqdm(total=n_scans, unit="scan", file=sys.stdout, mininterval=often_s, miniters=0)
+
+
+def _play(player: Any, recording: Recording, rate_hz: float | None, bar: Any) -> str | None:
+    """Play with a bar of progress; return what went wrong, in one sentence."""
     from cello3d_ros.ros.replay import play
 
-    with tqdm(
-        total=len(recording), desc=recording.name, unit="scan", disable=not sys.stderr.isatty()
-    ) as bar:
-        try:
-            play(player, recording, rate_hz, progress=lambda n: bar.update(n - bar.n))
-        except Cello3dError as error:
-            return str(error)
+    try:
+        play(player, recording, rate_hz, progress=lambda n: bar.update(n - bar.n))
+    except Cello3dError as error:
+        return str(error)
     return None
 
 

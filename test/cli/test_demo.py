@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from consumer_rules import of_pose, of_twist
 
 from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.geometry.se3 import exp, inverse, transform
+from cello3d_ros.learning.measures import verdict
 from cello3d_ros.recordings import Scan
 from cello3d_ros.recordings.bag_writer import write_bag
 from cello3d_ros.tracking.warmup import room
@@ -55,7 +57,7 @@ def cello3d(*arguments: object, code: str = "") -> subprocess.CompletedProcess[s
         [sys.executable, "-c", run, *map(str, arguments)],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         check=False,
         env={**os.environ, "ROS_PYTHON_CHECK_FIELDS": "1"},
     )
@@ -76,6 +78,9 @@ def test_every_pair_of_a_bag_is_answered_and_judged(tmp_path, bag, model) -> Non
     assert summary["final_translation_error_m"] < 0.03
     assert 0.0 < summary["mean_mahalanobis_6dof"] < 10.0
     assert 0.0 <= summary["coverage_95"] <= 1.0
+    words = re.search(r"^The covariance is (.+) \(D2/6 ", done.stdout, re.MULTILINE)
+    assert words
+    assert words[1] == verdict(summary["mean_d2_over_6"])
     assert summary["min_eigenvalue"] == pytest.approx(1e-6, rel=0.01)
     assert 0.0 < summary["latency_ms"]["p50"] <= summary["latency_ms"]["p95"]
     assert (tmp_path / "out" / "trajectory.png").read_bytes().startswith(b"\x89PNG")
@@ -133,6 +138,7 @@ def test_a_missing_answer_is_one_sentence_and_status_1(tmp_path, model) -> None:
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["dropped"] == 1
     assert summary["median_translation_error_m"] is None
+    assert "Without ground truth" in done.stdout
 
 
 def test_a_recording_without_any_poses_is_answered_at_constant_velocity(tmp_path, model) -> None:
