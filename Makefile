@@ -1,6 +1,7 @@
 # make demo    set up, replay bags/demo through the node, judge its answers: build/demo/
 # make test    set up, run the whole test suite
 # make check   set up, lint, check types and import rules
+# make docs    set up, write the pages of the Python interface: build/docs/index.html
 
 PYTHON ?= python3
 VENV := .venv
@@ -10,7 +11,7 @@ BIN := $(VENV)/bin
 export CELLO3D_EVALUATION ?= $(realpath ../shared)
 export ROS_PYTHON_CHECK_FIELDS := 1
 
-.PHONY: demo test check format clean
+.PHONY: demo test check docs format clean
 
 demo: $(VENV)/.ready
 	$(BIN)/cello3d demo --out build/demo
@@ -23,6 +24,9 @@ check: $(VENV)/.ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(VENV)/.ready
+	$(BIN)/python docs/api.py build/docs
 
 format: $(VENV)/.ready
 	$(BIN)/ruff check --fix .

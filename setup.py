@@ -1,5 +1,6 @@
 import sys
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
@@ -17,7 +18,9 @@ CSV = ["pyarrow>=15"]  # reads clouds and poses in CSV files; has no rosdep key
 CLUSTER = ["distributed>=2024.1"]
 SMALL_GICP = ["small_gicp>=1.0"]
 REPORT = ["plotly>=6"]  # maintained; its 3-D views work in one file without a network
+TOOLS = ["ruff", "mypy", "import-linter", "types-PyYAML", "playwright"]
 FUSION = ["gtsam>=4.3"]  # pose graphs; its wheels take the numpy of today
+DOCS = ["pdoc>=15"]  # reads docstrings as they are, needs no configuration and no theme
 BENCH = ["kiss-icp>=1.2"]  # what benchmarks/online.py compares with
 TEST = [
     "pytest",
@@ -34,6 +37,8 @@ setup(
     name=NAME,
     version="0.1.0",
     description="The covariance of ICP registrations, sampled, learned and predicted (CELLO-3D)",
+    long_description=Path("README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
     author="cello3d_ros maintainers",
     maintainer="cello3d_ros maintainers",
     maintainer_email="maintainers@cello3d.org",
@@ -63,8 +68,18 @@ setup(
         "report": REPORT,
         "test": TEST,
         "fusion": FUSION,
+        "docs": DOCS,
         "bench": BENCH,
-        "dev": [*TEST, "ruff", "mypy", "import-linter", "types-PyYAML", "playwright"],
+        "dev": [
+            *TEST,
+            *FUSION,
+            *DOCS,
+            "ruff",
+            "mypy",
+            "import-linter",
+            "types-PyYAML",
+            "playwright",
+        ],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
@@ -73,6 +88,7 @@ setup(
         (f"share/{NAME}/config/examples", glob("config/examples/*")),
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
         (f"share/{NAME}/rviz", glob("rviz/*.rviz")),
+        (f"share/{NAME}/bags/demo", glob("bags/demo/*")),
     ],
     entry_points={
         "console_scripts": [

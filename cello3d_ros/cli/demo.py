@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 _CHI2_6_95 = 12.591587  # 95 % of a chi-squared distribution of 6 degrees of freedom
 _SLICE_M, _SLICE_POINTS = 1.0, 3000  # of each scan: what the picture shows of the surroundings
 _ROS_IS_MISSING = (
-    "the demo needs ROS 2: source /opt/ros/jazzy/setup.bash, or "
-    "pip install ros-jazzy-rclpy ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
+    "the demo needs ROS 2: source /opt/ros/jazzy/setup.bash, or pip install 'cello3d_ros[ros]'; "
+    "cello3d replay {} --out answers runs the same without ROS"
 )
 
 _WITHOUT_ODOMETRY = (
@@ -40,7 +40,7 @@ _WITHOUT_ODOMETRY = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
     parser.add_argument(
-        "--recording", type=Path, default=Path("bags/demo"), help="bag or KITTI folder (bags/demo)"
+        "--recording", type=Path, help="bag or KITTI folder; by default the bag of the package"
     )
     parser.add_argument(
         "--out", type=Path, default=Path("build/demo"), help="folder of the results (build/demo)"
@@ -66,6 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Leave summary.json, trajectory.png and the node's messages; 1 if an answer is missing."""
     if arguments.rate is not None and not arguments.rate > 0:
         raise Cello3dError(f"--rate must be above 0: {arguments.rate}")
+    arguments.recording = arguments.recording or demo_bag()
     recording = open_source(arguments.recording, arguments)
     out: Path = arguments.out
     try:
@@ -92,6 +93,18 @@ def run(arguments: argparse.Namespace) -> int:
     if complaint is not None:
         raise Cello3dError(complaint)
     return 0
+
+
+def demo_bag() -> Path:
+    """Return the bag that comes with the package: in its source tree or in share/.
+
+    Raises Cello3dError.
+    """
+    for folder in Path(__file__).resolve().parents:
+        for place in ("bags/demo", "share/cello3d_ros/bags/demo"):
+            if (folder / place / "metadata.yaml").exists():
+                return folder / place
+    raise Cello3dError("the demo bag is not installed: name a recording with --recording")
 
 
 def judge(replay: Replay, n_pairs: int) -> dict[str, Any]:
@@ -273,7 +286,7 @@ def _replay(
     try:
         from cello3d_ros.ros.replay import Player
     except ImportError as error:
-        raise Cello3dError(f"{_ROS_IS_MISSING} ({error})") from None
+        raise Cello3dError(f"{_ROS_IS_MISSING.format(arguments.recording)} ({error})") from None
     parameters = [*(() if recording.has_odometry else _WITHOUT_ODOMETRY), *arguments.param]
     given = [word for text in parameters for word in ("-p", text)]
     if arguments.model:

@@ -13,7 +13,7 @@ import numpy as np
 from cello3d_ros.cli.recording_info import describe_recording, is_recording
 from cello3d_ros.cli.sources import add_source_arguments
 from cello3d_ros.config import PIPELINE, config_to
-from cello3d_ros.covariance.model import FORMAT_VERSION, Model, load_model
+from cello3d_ros.covariance.model import FORMAT_VERSION, SHIPPED, Model, find_model, load_model
 from cello3d_ros.errors import Cello3dError
 
 
@@ -27,7 +27,9 @@ class Kind(NamedTuple):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
-    parser.add_argument("path", metavar="SOURCE", type=Path, help="model file or recording")
+    parser.add_argument(
+        "path", metavar="SOURCE", type=Path, help="model file, shipped model or recording"
+    )
     add_source_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
@@ -43,6 +45,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 def describe(path: Path, arguments: argparse.Namespace) -> dict[str, Any]:
     """Return what is known of a file, in the form that JSON prints; ``kind`` says what it is."""
+    if str(path) in SHIPPED and not path.exists():
+        path = find_model(path)
     if not path.exists():
         raise Cello3dError(f"{path}: no such file or folder")
     for kind in KINDS:

@@ -116,11 +116,22 @@ class Estimate(NamedTuple):
 
 
 class Estimator:
-    """Registers pairs of clouds and finds the covariance of each result.
+    """Registers pairs of scans and finds the covariance of each result.
 
-    >>> estimator = Estimator("general")
-    >>> estimator.pipeline.icp.n_neighbors
-    3
+    Call it with two arrays of points, (N, 3) and (M, 3), metres, each in the frame of its sensor,
+    and the first guess of T_ref_read, (4, 4); it returns an ``Estimate``.
+
+    >>> rng = np.random.default_rng(0)
+    >>> room = rng.uniform(-4.0, 4.0, (6000, 3))
+    >>> room[np.arange(6000), rng.integers(3, size=6000)] = rng.choice([-4.0, 4.0], 6000)
+    >>> reference, reading = room[::2], room[1::2] - [0.1, 0.0, 0.0]
+    >>> r = Estimator("general")(reading, reference, np.eye(4))
+    >>> bool(np.abs(r.T_ref_read[:3, 3] - [0.1, 0.0, 0.0]).max() < 0.02)
+    True
+    >>> r.covariance.shape, r.covariance_ros().shape, r.covariance_gtsam().shape
+    ((6, 6), (6, 6), (6, 6))
+    >>> r.trust.converged, r.trust.is_lost
+    (True, False)
     """
 
     def __init__(
