@@ -16,6 +16,7 @@ VERBS = {
     "info": "say what a model or a recording holds",
     "convert": "turn any recording into a rosbag2, a KITTI folder or plain clouds",
     "simulate": "scan a simulated world into a rosbag2",
+    "align": "find reference poses from the recording itself",
     "sample": "sample ICP on every pair of recordings into a dataset",
     "train": "learn a model from datasets",
     "evaluate": "judge covariances beside every baseline",

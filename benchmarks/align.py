@@ -1,0 +1,173 @@
+"""Joint reference poses against exact truth, beside pairwise ICP, in simulated worlds.
+
+    python benchmarks/align.py [--kinds garden,hall] [--steps 0.1,0.5] [--scanners spinning32]
+
+Each recording is aligned from its clouds alone.  A line: kind, scanner, step; root mean square
+error of a step by pairwise ICP (default pipeline, started near the truth) and by joint poses;
+their ratio; the error that the alignment expects; scans left out.  Lines that are in ``--out``
+already are not computed again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from cello3d_ros.clouds.shape import prepare
+from cello3d_ros.config import Pipeline
+from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.learning.align import align
+from cello3d_ros.recordings.recording import Scan
+from cello3d_ros.registration.icp import register
+from cello3d_ros.simulation.paths import Route, walk
+from cello3d_ros.simulation.scanner import SCANNERS, raycasting_scene, scan
+from cello3d_ros.simulation.worlds import build_world
+
+KINDS = "rooms,hall,corridor,stairs,garden,wood"
+PERIOD_NS = 100_000_000
+
+
+class Frozen:
+    """A recording of a world from given poses; scans carry no pose."""
+
+    n_projected = 0
+
+    def __init__(self, kind: str, scanner: str, seed: int, step_m: float, n_scans: int) -> None:
+        """Scan a world each ``step_m`` along its route."""
+        layout, way = np.random.default_rng(seed).spawn(2)
+        world = build_world(kind, layout)
+        scene = raycasting_scene(world.mesh)
+        self.name = f"{kind}-{scanner}-{step_m:g}-{seed}"
+        self.truth = poses_along(world.route, step_m, n_scans, way)
+        self.clouds = [
+            scan(scene, SCANNERS[scanner], T, np.random.default_rng([seed, k]))
+            for k, T in enumerate(self.truth)
+        ]
+
+    def __len__(self) -> int:
+        return len(self.clouds)
+
+    def __iter__(self) -> Iterator[Scan]:
+        for k, points in enumerate(self.clouds):
+            yield Scan(stamp_ns=(k + 1) * PERIOD_NS, points=points)
+
+    def track(self) -> None:
+        """There are no poses."""
+
+
+def poses_along(route: Route, step_m: float, n: int, rng: np.random.Generator) -> Array:
+    """Return poses (n, 4, 4) a step apart on the way of a simulated walk."""
+    T = walk(route, 10 + int(n * step_m / 0.3), rng.uniform(0.9, 1.5), rng)
+    s = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)))
+    at = 0.5 + step_m * np.arange(n)
+    i = np.minimum(np.searchsorted(s, at, side="right") - 1, len(s) - 2)
+    shares = (at - s[i]) / (s[i + 1] - s[i])
+    return np.array([se3.interpolate(T[k], T[k + 1], a) for k, a in zip(i, shares, strict=True)])
+
+
+def pairwise(recording: Frozen) -> Array:
+    """Return the errors (n - 1, 6) of default ICP on each pair in a row."""
+    pipeline, truth = Pipeline(), recording.truth
+    clouds = [
+        prepare(points, pipeline.cloud, np.random.default_rng(k))
+        for k, points in enumerate(recording.clouds)
+    ]
+    found = []
+    for k in range(1, len(clouds)):
+        rng = np.random.default_rng([7, k])
+        T = se3.inverse(truth[k - 1]) @ truth[k]
+        start = T @ se3.exp(rng.normal(size=6) * np.repeat([0.03, 0.005], 3))
+        result = register(clouds[k], clouds[k - 1], start, pipeline.icp, rng)
+        found.append(se3.log(se3.inverse(T) @ result.T_ref_read))
+    return np.array(found)
+
+
+def errors(poses: Array, truth: Array) -> Array:
+    """Return the errors of the steps between poses (n, 4, 4).  (n - 1, 6)."""
+    steps, exact = (se3.inverse(T[:-1]) @ T[1:] for T in (poses, truth))
+    return np.asarray(se3.log(se3.inverse(exact) @ steps))
+
+
+def rms(xi: Array) -> list[float]:
+    """Return the root mean square errors in mm and mrad."""
+    squares = (xi**2).mean(axis=0)
+    return [1e3 * float(np.sqrt(squares[part].sum())) for part in (slice(0, 3), slice(3, 6))]
+
+
+def measured(kind: str, scanner: str, step_m: float, n_scans: int, seed: int) -> dict[str, object]:
+    """Return one line of the table."""
+    recording = Frozen(kind, scanner, seed, step_m, n_scans)
+    single = pairwise(recording)
+    found = align(recording)
+    kept = found.members()
+    both = np.flatnonzero(np.diff(kept) == 1)
+    joint = errors(found.poses[kept], recording.truth[kept])[both]
+    steps = zip(kept[:-1][both], kept[1:][both], strict=True)
+    Y = np.array([found.step_covariance(int(i), int(j)) for i, j in steps])
+    d2 = np.einsum("ni,nij,nj->n", joint, np.linalg.inv(Y), joint)
+    return {
+        "recording": recording.name,
+        "kind": kind,
+        "step_m": step_m,
+        "pairwise": rms(single[kept[:-1][both]]),
+        "joint": rms(joint),
+        "expected": [1e3 * sigma for sigma in found.sigmas()],
+        "d2_over_6": float(d2.mean() / 6.0),
+        "n_left_out": len(found.reasons),
+        "n_sweeps": len(found.moves_m),
+    }
+
+
+def main() -> None:
+    """Measure what is missing and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kinds", default=KINDS)
+    parser.add_argument("--steps", default="0.02,0.1,0.5,1.5")
+    parser.add_argument("--scanners", default="spinning32")
+    parser.add_argument("--seeds", default="11,12")
+    parser.add_argument("--scans", type=int, default=12)
+    parser.add_argument("--out", type=Path, help="JSON lines, to write and to go on from")
+    arguments = parser.parse_args()
+    done = {}
+    if arguments.out and arguments.out.exists():
+        rows = map(json.loads, arguments.out.read_text().splitlines())
+        done = {row["recording"]: row for row in rows}
+    ratios = defaultdict(list)
+    for kind in arguments.kinds.split(","):
+        for scanner in arguments.scanners.split(","):
+            for step in map(float, arguments.steps.split(",")):
+                for seed in map(int, arguments.seeds.split(",")):
+                    n = max(arguments.scans, 40) if step < 0.05 else arguments.scans
+                    name = f"{kind}-{scanner}-{step:g}-{seed}"
+                    row = done.get(name) or measured(kind, scanner, step, n, seed)
+                    if name not in done and arguments.out:
+                        with arguments.out.open("a") as file:
+                            file.write(json.dumps(row) + "\n")
+                    ratios[kind, scanner, step].append(row)
+                print(line(kind, scanner, step, ratios[kind, scanner, step]), flush=True)
+
+
+def line(kind: str, scanner: str, step: float, rows: list[dict]) -> str:
+    """Return one line for people, over the seeds."""
+    mean = {
+        key: np.sqrt(np.mean(np.square([row[key] for row in rows]), axis=0))
+        for key in ("pairwise", "joint", "expected")
+    }
+    ratio = mean["joint"] / mean["pairwise"]
+    return (
+        f"{kind:9} {scanner:11} {step:5.2f} m  pairwise {mean['pairwise'][0]:6.2f} mm "
+        f"{mean['pairwise'][1]:5.2f} mrad  joint {mean['joint'][0]:6.2f} {mean['joint'][1]:5.2f}  "
+        f"ratio {ratio[0]:.2f} {ratio[1]:.2f}  expected {mean['expected'][0]:6.2f} "
+        f"{mean['expected'][1]:5.2f}  D2/6 {np.mean([row['d2_over_6'] for row in rows]):.2f}  "
+        f"left out {sum(row['n_left_out'] for row in rows)}"
+    )
+
+
+if __name__ == "__main__":
+    main()

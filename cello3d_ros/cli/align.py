@@ -1,0 +1,88 @@
+"""``cello3d align RECORDING --out POSES.tum``: reference poses from the recording itself."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from cello3d_ros.cli.sources import add_source_arguments, open_source
+from cello3d_ros.errors import RecordingError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the verb."""
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="bag or data set")
+    parser.add_argument(
+        "--out",
+        metavar="POSES",
+        type=Path,
+        required=True,
+        help="TUM file to write; further parts become POSES.2.tum and so on",
+    )
+    add_source_arguments(parser)
+    parser.add_argument("--report", metavar="FILE", type=Path, help="JSON of every scan, to write")
+    parser.add_argument("--seed", type=int, default=0, help="of the random subsamples")
+    parser.add_argument(
+        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="threads"
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Align, write the poses and say how good they are; goes on where it was interrupted."""
+    from threadpoolctl import threadpool_limits
+
+    from cello3d_ros.learning.align import align
+    from cello3d_ros.learning.align_report import as_dict, sentences, write_poses
+    from cello3d_ros.recordings.start_poses import start_track
+
+    for path in (arguments.out, arguments.report):
+        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
+            raise RecordingError(f"cannot write {path}: not a file in an existing folder")
+    poses, arguments.poses = arguments.poses, None
+    recording = open_source(arguments.recording, arguments)
+    start = None if poses is None else start_track(poses, recording)
+    folder = arguments.out.with_name(f".{arguments.out.name}.align")
+    with bar(recording.name) as progress, threadpool_limits(1, user_api="blas"):
+        found = align(
+            recording,
+            start=start,
+            folder=folder,
+            seed=arguments.seed,
+            n_threads=arguments.jobs,
+            progress=progress,
+        )
+    written = write_poses(arguments.out, found)
+    if arguments.report is not None:
+        _write_json(arguments.report, as_dict(found))
+    shutil.rmtree(folder, ignore_errors=True)
+    print("\n".join([", ".join(map(str, written)), *sentences(found)]))
+
+
+@contextmanager
+def bar(name: str) -> Iterator[Callable[[int, int], None]]:
+    """Give a function of (done, total) that shows progress and time left on a terminal."""
+    from tqdm import tqdm
+
+    with tqdm(
+        total=1, desc=f"aligning {name}", unit="scan", disable=not sys.stderr.isatty(), leave=False
+    ) as shown:
+
+        def progress(done: int, total: int) -> None:
+            shown.total = total
+            shown.update(done - shown.n)
+
+        yield progress
+
+
+def _write_json(path: Path, report: dict[str, Any]) -> None:
+    from cello3d_ros.atomic import new_file
+
+    with new_file(path) as partial:
+        partial.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")

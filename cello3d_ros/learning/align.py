@@ -1,0 +1,441 @@
+"""Reference poses from the recording itself: every scan registered to all its neighbours.
+
+Pairs of scans in a row give first poses (``align_chain``).  Then sweeps, in turns forwards and
+backwards, register each scan to the union of up to 8 scans before and 8 after it, until the
+median change of a step is below a millimetre.  What all neighbours share, a bias of the
+registration, stays.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cello3d_ros.atomic import new_file
+from cello3d_ros.clouds.shape import local_shape
+from cello3d_ros.config import Pipeline
+from cello3d_ros.errors import CloudError, RecordingError
+from cello3d_ros.geometry.pose_track import PoseTrack
+from cello3d_ros.geometry.se3 import Array, adjoint, inverse, log
+from cello3d_ros.learning.align_chain import Chain, Link, Placed, build_chain
+from cello3d_ros.learning.align_scans import ScanStore, ShapedScan, filtered_scan
+from cello3d_ros.learning.align_sweeps import (
+    N_BEFORE,
+    cloud_of,
+    motion_of,
+    neighbors_of,
+    own_points,
+    visit,
+)
+from cello3d_ros.learning.identity import fingerprint
+from cello3d_ros.recordings.recording import Recording, Scan
+
+MAX_SWEEPS = 8
+_FEWEST_SWEEPS = 3
+_TOLERANCE_M = 1e-3  # median change of the steps in a sweep that ends them
+_KEYFRAME_M, _KEYFRAME_RAD = 0.05, 0.02  # motion that makes a new keyframe
+_SAVE_S = 20.0
+_SPREAD = 4  # scans before and after, over which the spread of half-sets is averaged
+_FACTOR = 1.3  # of the half-sets' spread, from errors against exact truth: docs/align.md
+_FLOOR_M, _FLOOR_RAD = 1e-4, 1e-5
+_OUTLIER = 8.0  # times the usual difference of half-sets: a scan that does not hold,
+_OUTLIER_M, _OUTLIER_RAD = 0.03, 0.015  # from these on
+_STATE = "state.npz"
+_VERSION = 1  # of the state
+_FACTS = ("sweep", "position", "is_last", "moves_m", "compensated")
+_ARRAYS = ("stamps_ns", "keyframes", "held", "moved", "halves", "first_poses")
+
+Progress = Callable[[int, int], None]  # scans visited so far, and in all as far as known
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Alignment:
+    """Reference poses of a recording.
+
+    poses: (n, 4, 4), T_part_sensor; the first scan of a part keeps the pose it started with.
+    covariances: (n, 6, 6), of each pose beside its neighbours, (u, omega), sensor side, as
+    ``T_true = T exp(xi)``; zeros where the scan is left out.  part: (n,), scans of one number
+    have poses in one frame; 0 is the longest, -1 is left out.  reasons: why a scan is left out.
+    pairwise: (m, 6), of the links of the chain: pairwise registration minus joint poses.
+    moves_m: median change of the steps in each sweep.  compensated: whether the motion within
+    scans was undone.
+    """
+
+    name: str
+    stamps_ns: NDArray[np.int64]
+    poses: Array
+    covariances: Array
+    part: NDArray[np.int64]
+    reasons: dict[int, str]
+    pairwise: Array
+    moves_m: tuple[float, ...]
+    n_contradicted: int = 0
+    n_searched: int = 0
+    compensated: bool = False
+
+    @property
+    def n_parts(self) -> int:
+        """Number of parts."""
+        return int(self.part.max(initial=-1)) + 1
+
+    def members(self, part: int = 0) -> NDArray[np.int64]:
+        """Return the scans of a part."""
+        return np.flatnonzero(self.part == part)
+
+    def step_covariance(self, i: int, j: int) -> Array:
+        """Return the covariance (6, 6) of ``T_i^-1 T_j``, on the side of scan j."""
+        Ad = adjoint(inverse(self.poses[j]) @ self.poses[i])
+        return np.asarray(Ad @ self.covariances[i] @ Ad.T + self.covariances[j])
+
+    def sigmas(self) -> tuple[float, float]:
+        """Return the root mean square errors of a step that are expected, in m and rad."""
+        Y = [
+            self.step_covariance(int(i), int(j))
+            for part in range(self.n_parts)
+            for i, j in zip(self.members(part)[:-1], self.members(part)[1:], strict=True)
+        ]
+        D = np.mean([np.diagonal(C) for C in Y], axis=0)
+        return float(np.sqrt(D[:3].sum())), float(np.sqrt(D[3:].sum()))
+
+    def pairwise_rms(self) -> tuple[float, float]:
+        """Return how far pairwise registrations are from these poses, rms, in m and rad."""
+        squares = (self.pairwise**2).mean(axis=0) if len(self.pairwise) else np.zeros(6)
+        return float(np.sqrt(squares[:3].sum())), float(np.sqrt(squares[3:].sum()))
+
+
+@dataclass
+class _State:
+    """What an interrupted alignment goes on from."""
+
+    chain: Chain
+    reasons: dict[int, str]
+    stamps_ns: NDArray[np.int64]
+    keyframes: NDArray[np.bool_]
+    held: NDArray[np.bool_]
+    moved: Array
+    halves: Array
+    first_poses: Array
+    sweep: int = 1
+    position: int = 0
+    is_last: bool = False
+    moves_m: list[float] = field(default_factory=list)
+    compensated: bool = False
+
+
+def align(
+    recording: Recording,
+    pipeline: Pipeline | None = None,
+    start: PoseTrack | None = None,
+    *,
+    folder: Path | None = None,
+    seed: int = 0,
+    n_threads: int = 1,
+    progress: Progress = lambda done, total: None,
+) -> Alignment:
+    """Find the poses of a recording's scans from the scans.
+
+    start: poses to start from; without them odometry, else the poses of the recording, else none.
+    folder: where scans and the state are kept, so that the same call goes on after an interrupt;
+    without it a temporary one.  The result depends on the recording, start and seed alone.
+    Raises RecordingError when fewer than 3 scans hold to one another.
+    """
+    pipeline = pipeline or Pipeline()
+    with ExitStack() as stack:
+        if folder is None:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="align-")))
+        folder.mkdir(parents=True, exist_ok=True)
+        store = ScanStore(folder, 4 * N_BEFORE + 2)
+        key = _key(recording, pipeline, start, seed)
+        state = _load(folder, key)
+        if state is None:
+            state = _begin(recording, pipeline, start, store, seed, progress)
+            _save(folder, key, state)
+        _sweep(state, store, pipeline, folder, key, seed, n_threads, progress)
+    return _finished(recording.name, state)
+
+
+def _begin(
+    recording: Recording,
+    pipeline: Pipeline,
+    start: PoseTrack | None,
+    store: ScanStore,
+    seed: int,
+    progress: Progress,
+) -> _State:
+    """Read all scans once, keep them in the store and build the chain."""
+    n = len(recording)
+    reasons: dict[int, str] = {}
+    stamps = np.zeros(n, np.int64)
+    compensated = False
+
+    def scans() -> Iterator[Placed]:
+        nonlocal compensated
+        last = b""
+        for k, scan in enumerate(recording):
+            progress(k + 1, n * (1 + MAX_SWEEPS))
+            stamps[k] = scan.stamp_ns
+            digest = hashlib.sha256(np.ascontiguousarray(scan.points).tobytes()).digest()
+            if digest == last:
+                reasons[k] = "repeats the scan before"
+                continue
+            try:
+                raw = filtered_scan(scan, pipeline.cloud, np.random.default_rng([seed, k]))
+            except CloudError as error:
+                reasons[k] = str(error)
+                continue
+            last = digest
+            compensated |= raw.time_s is not None
+            store.add_raw(k, raw)
+            cloud = cloud_of(raw.points)
+            cloud = cloud._replace(normals=local_shape(cloud.tree, pipeline.cloud.n_neighbors)[0])
+            store.add_shaped(k, 0, ShapedScan(cloud.points, cloud.normals))
+            yield Placed(k, scan.stamp_ns, cloud, _start_pose(scan, start))
+
+    chain = build_chain(scans(), n, pipeline.icp, seed)
+    for k in np.flatnonzero(chain.part < 0):
+        reasons.setdefault(int(k), "holds to none of the scans around it")
+    if not (chain.part >= 0).any():
+        raise RecordingError(_nothing(recording.name, n, reasons))
+    return _State(
+        chain=chain,
+        reasons=reasons,
+        stamps_ns=stamps,
+        keyframes=_keyframes(chain),
+        held=chain.part >= 0,
+        moved=np.zeros((n, 6)),
+        halves=np.zeros((n, 6)),
+        first_poses=chain.poses.copy(),
+        compensated=compensated,
+    )
+
+
+def _start_pose(scan: Scan, start: PoseTrack | None) -> Array | None:
+    if start is not None:
+        return start.at(scan.stamp_ns)
+    return scan.T_odom_sensor if scan.T_odom_sensor is not None else scan.T_world_sensor
+
+
+def _nothing(name: str, n: int, reasons: dict[int, str]) -> str:
+    if n < 3:
+        return f"{name} has {n} scans; aligning needs at least 3"
+    counts: dict[str, int] = {}
+    for reason in reasons.values():
+        counts[reason] = counts.get(reason, 0) + 1
+    most = max(counts, key=lambda reason: counts[reason])
+    return f"no 3 of the {n} scans of {name} hold to one another; most often: a scan {most}"
+
+
+def _keyframes(chain: Chain) -> NDArray[np.bool_]:
+    """Return which scans others are registered to: the first of a part, then after each motion."""
+    is_key = np.zeros(len(chain.part), np.bool_)
+    last: dict[int, Array] = {}
+    for k in np.flatnonzero(chain.part >= 0):
+        part, T = int(chain.part[k]), chain.poses[k]
+        if part in last:
+            xi = log(inverse(last[part]) @ T)
+            if np.linalg.norm(xi[:3]) < _KEYFRAME_M and np.linalg.norm(xi[3:]) < _KEYFRAME_RAD:
+                continue
+        is_key[k], last[part] = True, T
+    return is_key
+
+
+def _sweep(
+    state: _State,
+    store: ScanStore,
+    pipeline: Pipeline,
+    folder: Path,
+    key: str,
+    seed: int,
+    n_threads: int,
+    progress: Progress,
+) -> None:
+    """Visit all scans until they rest; goes on where the state says."""
+    members = np.flatnonzero(state.chain.part >= 0)
+    n = len(state.chain.part)
+    saved = time.monotonic()
+    while state.sweep <= MAX_SWEEPS:
+        order = members if state.sweep % 2 else members[::-1]
+        done = set(order[: state.position].tolist())
+        for k in order[state.position :].tolist():
+            _visit(state, store, pipeline, k, done, seed, n_threads)
+            done.add(k)
+            state.position += 1
+            progress(n * state.sweep + state.position, n * (1 + MAX_SWEEPS))
+            if time.monotonic() - saved > _SAVE_S:
+                _save(folder, key, state)
+                saved = time.monotonic()
+        state.moves_m.append(_median_move(state.moved[members, :3], state.chain.part[members]))
+        if state.is_last:
+            return
+        rests = state.moves_m[-1] < _TOLERANCE_M and state.sweep >= _FEWEST_SWEEPS
+        state.sweep, state.position = state.sweep + 1, 0
+        state.is_last = rests or state.sweep == MAX_SWEEPS
+        _save(folder, key, state)
+
+
+def _median_move(moved: Array, part: NDArray[np.int64]) -> float:
+    """Return the median change of a step, m: what all scans of a part share moves no step."""
+    steps = np.diff(moved, axis=0)[part[1:] == part[:-1]]
+    return float(np.median(np.linalg.norm(steps, axis=1))) if len(steps) else 0.0
+
+
+def _visit(
+    state: _State,
+    store: ScanStore,
+    pipeline: Pipeline,
+    k: int,
+    done: set[int],
+    seed: int,
+    n_threads: int,
+) -> None:
+    chain, sweep = state.chain, state.sweep
+    members = np.flatnonzero((chain.part == chain.part[k]) & state.held)
+    keyframes = members[state.keyframes[members]]
+    around = neighbors_of(k, keyframes[keyframes != k]).tolist()
+    neighbors = {j: store.shaped(j, sweep if j in done else sweep - 1) for j in around}
+    own = own_points(store, k, motion_of(k, chain.poses, state.stamps_ns, members))
+    found = visit(k, chain.poses, neighbors, own, pipeline, seed, state.is_last, n_threads)
+    chain.poses[k] = found.T
+    state.held[k] = found.holds
+    state.moved[k] = found.moved if found.holds else 0.0
+    state.halves[k] = found.halves
+    store.add_shaped(k, sweep, found.shaped)
+
+
+def _finished(name: str, state: _State) -> Alignment:
+    chain, reasons = state.chain, dict(state.reasons)
+    part = chain.part.copy()
+    part[~state.held] = -1
+    for k in np.flatnonzero((chain.part >= 0) & ~state.held):
+        reasons[int(k)] = "does not hold to its neighbours"
+    for k in np.flatnonzero((part >= 0) & _torn(state.halves, part >= 0)):
+        part[k] = -1
+        reasons[int(k)] = (
+            f"halves of its neighbours put it {np.linalg.norm(state.halves[k, :3]):.3f} m and "
+            f"{np.linalg.norm(state.halves[k, 3:]):.3f} rad apart"
+        )
+    poses, covariances = chain.poses.copy(), np.zeros((len(part), 6, 6))
+    for p in np.unique(part[part >= 0]):
+        members = np.flatnonzero(part == p)
+        covariances[members] = _spread(state.halves[members])
+        poses[members] = (
+            state.first_poses[members[0]] @ inverse(poses[members[0]]) @ poses[members]
+        )
+    pairwise = [
+        log(inverse(inverse(chain.poses[link.reference]) @ chain.poses[k]) @ link.T_ref_read)
+        for k, link in chain.links.items()
+        if part[k] >= 0 and part[link.reference] >= 0
+    ]
+    return Alignment(
+        name=name,
+        stamps_ns=state.stamps_ns,
+        poses=poses,
+        covariances=covariances,
+        part=part,
+        reasons=dict(sorted(reasons.items())),
+        pairwise=np.array(pairwise).reshape(-1, 6),
+        moves_m=tuple(state.moves_m),
+        n_contradicted=chain.n_contradicted,
+        n_searched=chain.n_searched,
+        compensated=state.compensated,
+    )
+
+
+def _torn(halves: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which scans the halves of their neighbours put in places far apart."""
+    torn = np.zeros(len(halves), np.bool_)
+    for columns, least in ((slice(0, 3), _OUTLIER_M), (slice(3, 6), _OUTLIER_RAD)):
+        apart = np.linalg.norm(halves[:, columns], axis=1)
+        torn |= apart > max(least, _OUTLIER * float(np.median(apart[known])))
+    return torn
+
+
+def _spread(halves: Array) -> Array:
+    """Return the covariance (m, 6, 6) of each pose from the half-sets (m, 6) around it.
+
+    A full set errs by half of what its halves differ by.  So few differences give no shape: half
+    of the covariance is theirs, half is alike in all directions.
+    """
+    outer = halves[:, :, None] * halves[:, None, :] / 4.0
+    around = [slice(max(0, k - _SPREAD), k + _SPREAD + 1) for k in range(len(halves))]
+    local = np.array([outer[rows].mean(axis=0) for rows in around])
+    variances = np.diagonal(local, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
+    even = np.repeat(variances, 3, axis=1)[:, :, None] * np.eye(6)
+    floor = np.diag(np.repeat([_FLOOR_M**2, _FLOOR_RAD**2], 3))
+    return np.asarray(_FACTOR**2 * 0.5 * (local + even) + floor)
+
+
+def _key(recording: Recording, pipeline: Pipeline, start: PoseTrack | None, seed: int) -> str:
+    """Return what tells apart alignments: recording, settings and start."""
+    digest = hashlib.sha256(f"{fingerprint(recording)} {len(recording)} {seed}".encode())
+    digest.update(repr((pipeline.cloud, pipeline.icp, _VERSION)).encode())
+    for stamp_ns, T in start or ():
+        digest.update(f"{stamp_ns}".encode() + T.tobytes())
+    return digest.hexdigest()[:32]
+
+
+def _save(folder: Path, key: str, state: _State) -> None:
+    chain = state.chain
+    links = sorted(chain.links.items())
+    facts = {
+        "key": key,
+        "reasons": {str(k): reason for k, reason in state.reasons.items()},
+        "n_contradicted": chain.n_contradicted,
+        "n_searched": chain.n_searched,
+        **{name: getattr(state, name) for name in _FACTS},
+    }
+    with new_file(folder / _STATE) as path, path.open("wb") as file:
+        np.savez(
+            file,
+            facts=np.frombuffer(json.dumps(facts).encode(), np.uint8),
+            poses=chain.poses,
+            part=chain.part,
+            link_scans=np.array([[k, link.reference] for k, link in links]).reshape(-1, 2),
+            link_poses=np.array([link.T_ref_read for _, link in links]).reshape(-1, 4, 4),
+            link_shares=np.array([link.share for _, link in links]),
+            **{name: getattr(state, name) for name in _ARRAYS},
+        )
+
+
+def _load(folder: Path, key: str) -> _State | None:
+    """Return the state in a folder; None where there is none.
+
+    Raises RecordingError where it is that of another alignment or damaged.
+    """
+    path = folder / _STATE
+    if not path.exists():
+        return None
+    try:
+        with np.load(path) as file:
+            arrays = dict(file)
+        facts = json.loads(arrays["facts"].tobytes())
+        if facts["key"] != key:
+            raise RecordingError(
+                f"{folder} holds the alignment of another recording or start; remove it"
+            )
+        links = zip(arrays["link_scans"], arrays["link_poses"], arrays["link_shares"], strict=True)
+        chain = Chain(
+            arrays["poses"],
+            arrays["part"],
+            {int(ij[0]): Link(int(ij[1]), T, float(share)) for ij, T, share in links},
+            facts["n_contradicted"],
+            facts["n_searched"],
+        )
+        return _State(
+            chain=chain,
+            reasons={int(k): reason for k, reason in facts["reasons"].items()},
+            **{name: arrays[name] for name in _ARRAYS},
+            **{name: facts[name] for name in _FACTS},
+        )
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+        raise RecordingError(f"{path} is damaged; remove {folder} to start again") from None

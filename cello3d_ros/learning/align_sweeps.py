@@ -1,0 +1,167 @@
+"""Sweeps: each scan registered to all its neighbours at once, again and again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cello3d_ros.clouds.neighbors import KdTree, build_tree, nearest
+from cello3d_ros.clouds.shape import Cloud
+from cello3d_ros.config import IcpConfig, Pipeline
+from cello3d_ros.geometry.se3 import Array, inverse, log, transform
+from cello3d_ros.learning.align_chain import MIN_SHARE, share_on_surfaces
+from cello3d_ros.learning.align_scans import ScanStore, ShapedScan, undistorted
+from cello3d_ros.registration.icp import register
+
+N_BEFORE = 8  # neighbours of a scan on either side
+_N_POINTS = 8000  # of the reading
+_EVERY = 0  # reference points: all
+_MAX_MOVE_M, _MAX_MOVE_RAD = 1.0, 0.3  # a scan that a sweep moves farther does not hold
+
+
+class Visit(NamedTuple):
+    """What one scan's registration to its neighbours gave.
+
+    T: (4, 4), its pose; moved: (6,), how it moved; share: of its points on their surfaces; holds:
+    whether there was an answer; halves: (6,), between the registrations to either half of the
+    neighbours, zeros if not asked for; shaped: the scan without its own motion, with normals of
+    all scans.
+    """
+
+    T: Array
+    moved: Array
+    share: float
+    holds: bool
+    halves: Array
+    shaped: ShapedScan
+
+
+def sweep_icp(icp: IcpConfig) -> IcpConfig:
+    """Return the settings of ICP in a sweep: those of the pipeline, to the end, of all points."""
+    return replace(
+        icp,
+        backend="icp",
+        error_metric="point_to_plane",
+        rotation_epsilon_rad=1e-5,
+        translation_epsilon_m=1e-4,
+        max_iterations=40,
+        n_reading_points=_N_POINTS,
+        n_reference_points=_EVERY,
+    )
+
+
+def neighbors_of(k: int, keyframes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the keyframes around scan k: up to 8 before and 8 after it, itself left out."""
+    before, after = np.searchsorted(keyframes, [k, k + 1])
+    return np.concatenate(
+        [keyframes[max(0, before - N_BEFORE) : before], keyframes[after : after + N_BEFORE]]
+    )
+
+
+def visit(
+    k: int,
+    poses: Array,
+    neighbors: dict[int, ShapedScan],
+    own: Array,
+    pipeline: Pipeline,
+    seed: int,
+    wants_halves: bool,
+    n_threads: int = 1,
+) -> Visit:
+    """Register scan k to the union of its neighbours, and find the normals of its points.
+
+    poses: (n, 4, 4).  neighbors: scan -> its points.  own: (N, 3), points of scan k.
+    The normals are those of all scans together: denser than one scan, and without the rings of
+    its pattern.
+    """
+    if not neighbors:
+        alone = ShapedScan(own, np.zeros_like(own))
+        return Visit(poses[k], np.zeros(6), 0.0, False, np.zeros(6), alone)
+    icp = sweep_icp(pipeline.icp)
+    reading = cloud_of(own)
+    union = gathered(poses[k], poses, neighbors)
+    rng = np.random.default_rng([seed, k])
+    found = register(reading, union, np.eye(4), icp, rng)
+    moved = log(found.T_ref_read)
+    share = share_on_surfaces(reading, union, found.T_ref_read, rng)
+    holds = (
+        found.has_answer
+        and share >= MIN_SHARE
+        and float(np.linalg.norm(moved[:3])) < _MAX_MOVE_M
+        and float(np.linalg.norm(moved[3:])) < _MAX_MOVE_RAD
+    )
+    step = found.T_ref_read if holds else np.eye(4)
+    halves = np.zeros(6)
+    if wants_halves and holds and len(neighbors) >= 2:
+        halves = _halves(k, poses, neighbors, reading, step, icp, seed)
+    normals = common_normals(reading.tree, union.tree, step, pipeline.cloud.n_neighbors, n_threads)
+    return Visit(poses[k] @ step, moved, share, holds, halves, ShapedScan(reading.points, normals))
+
+
+def gathered(T_world: Array, poses: Array, scans: dict[int, ShapedScan]) -> Cloud:
+    """Return the points and normals of scans as one cloud in the frame of a pose."""
+    T = inverse(T_world) @ poses[list(scans)]
+    points = np.concatenate([transform(M, s.points) for M, s in zip(T, scans.values())])
+    normals = np.concatenate([s.normals @ M[:3, :3].T for M, s in zip(T, scans.values())])
+    return cloud_of(points, normals)
+
+
+def common_normals(own: KdTree, others: KdTree, T: Array, k: int, n_threads: int = 1) -> Array:
+    """Return the normals (N, 3) of the points of ``own`` from the k nearest of both trees.
+
+    T: (4, 4), from the frame of ``own`` to that of ``others``.  They are in the frame of ``own``.
+    """
+    points = transform(T, own.points)
+    d2_own, i_own = nearest(own, own.points, k, n_threads)
+    d2_others, i_others = nearest(others, points, k, n_threads)
+    d2 = np.concatenate([d2_own, d2_others], axis=1)
+    first = np.argpartition(d2, k - 1, axis=1)[:, :k]
+    indices = np.take_along_axis(np.concatenate([i_own, i_others + len(points)], axis=1), first, 1)
+    near = np.concatenate([points, others.points])[indices]
+    near -= near.mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
+    return np.asarray(normals @ T[:3, :3])
+
+
+def _halves(
+    k: int,
+    poses: Array,
+    neighbors: dict[int, ShapedScan],
+    reading: Cloud,
+    start: Array,
+    icp: IcpConfig,
+    seed: int,
+) -> Array:
+    """Return ``log(T_a^-1 T_b)`` of the registrations to every other neighbour and to the rest."""
+    found = []
+    for part in (0, 1):
+        some = dict(list(neighbors.items())[part::2])
+        rng = np.random.default_rng([seed, k, part])
+        found.append(register(reading, gathered(poses[k], poses, some), start, icp, rng))
+    return np.asarray(log(inverse(found[0].T_ref_read) @ found[1].T_ref_read))
+
+
+def cloud_of(points: Array, normals: Array | None = None) -> Cloud:
+    """Return points in the order of their tree."""
+    tree = build_tree(points)
+    normals = np.empty((0, 3)) if normals is None else normals.take(tree.order, axis=0)
+    tree = tree._replace(order=np.arange(len(points)))
+    return Cloud(tree.points, normals, np.empty(0), np.empty(0), tree)
+
+
+def motion_of(
+    k: int, poses: Array, stamps_ns: NDArray[np.int64], members: NDArray[np.int64]
+) -> Array:
+    """Return the velocity (6,) of scan k between its neighbours in time among the members."""
+    at = int(np.searchsorted(members, k))
+    i, j = int(members[max(0, at - 1)]), int(members[min(len(members) - 1, at + 1)])
+    dt_s = 1e-9 * float(stamps_ns[j] - stamps_ns[i])
+    return log(inverse(poses[i]) @ poses[j]) / dt_s if dt_s > 0.0 else np.zeros(6)
+
+
+def own_points(store: ScanStore, k: int, velocity: Array) -> Array:
+    """Return the points of scan k without the motion within it."""
+    return undistorted(store.raw(k), velocity)

@@ -1,0 +1,221 @@
+"""Alignment: its poses against exact truth, its laws, and recordings with something wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cello3d_ros.config import IcpConfig, Pipeline
+from cello3d_ros.errors import RecordingError
+from cello3d_ros.geometry.pose_track import PoseTrack
+from cello3d_ros.geometry.se3 import Array, exp, inverse, log, transform
+from cello3d_ros.learning.align import Alignment, align
+from cello3d_ros.recordings.recording import Scan
+
+N_SCANS = 7
+PIPELINE = Pipeline(icp=IcpConfig(n_reading_points=1000))
+
+
+class Clouds:
+    """A recording of given scans."""
+
+    n_projected = 0
+
+    def __init__(self, scans: Sequence[Scan], name: str = "clouds") -> None:
+        self.scans, self.name = scans, name
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+    def __iter__(self) -> Iterator[Scan]:
+        return iter(self.scans)
+
+    def track(self) -> None: ...
+
+
+def box_points(rng: np.random.Generator, n: int, size: Array) -> Array:
+    """Return points (n, 3) on the surface of a box centred on the origin."""
+    points = rng.uniform(-0.5, 0.5, (n, 3))
+    rows, axis = np.arange(n), rng.choice(3, n, p=(1 / size) / (1 / size).sum())
+    points[rows, axis] = np.where(rng.uniform(size=n) < 0.5, -0.5, 0.5)
+    return points * size
+
+
+def surfaces(seed: int, n: int = 6000) -> Array:
+    """Return points of a furnished room; another seed is another room."""
+    rng = np.random.default_rng(seed)
+    size = np.array([8.0 + 3.0 * seed, 6.0 + seed, 3.0])
+    boxes = [box_points(rng, n // 2, size)]
+    for _ in range(5):
+        box = box_points(rng, n // 10, rng.uniform(0.4, 2.0, 3))
+        boxes.append(box + rng.uniform(-0.4, 0.4, 3) * size)
+    return np.concatenate(boxes)
+
+
+def true_poses(n: int = N_SCANS, step_m: float = 0.3) -> Array:
+    """Return poses (n, 4, 4) of a slight curve."""
+    step = exp(np.array([step_m, 0.02, 0.01, 0.005, 0.01, 0.04]))
+    T = [np.eye(4)]
+    for _ in range(n - 1):
+        T.append(T[-1] @ step)
+    return np.array(T)
+
+
+def scans_of(room: int, truth: Array, first_ns: int = 0, noise_m: float = 0.01) -> list[Scan]:
+    """Return scans of a room, each of points of its own, 0.1 s apart."""
+    found = []
+    for k, T in enumerate(truth):
+        rng = np.random.default_rng([room, k])
+        points = transform(inverse(T), surfaces(room, 12000))
+        points = points[rng.choice(len(points), 4000, replace=False)]
+        points += rng.normal(scale=noise_m, size=points.shape)
+        found.append(Scan(stamp_ns=first_ns + (k + 1) * 100_000_000, points=points))
+    return found
+
+
+def step_errors(found: Alignment, truth: Array) -> Array:
+    """Return the errors (n - 1, 6) of the steps."""
+    steps, exact = (inverse(T[:-1]) @ T[1:] for T in (found.poses, truth))
+    return np.asarray(log(inverse(exact) @ steps))
+
+
+@pytest.fixture(scope="module")
+def room() -> tuple[list[Scan], Array, Alignment]:
+    """A room, its true poses and its alignment from nothing but the clouds."""
+    truth = true_poses()
+    scans = scans_of(1, truth)
+    return scans, truth, align(Clouds(scans), PIPELINE)
+
+
+def test_joint_poses_are_nearer_the_truth_than_pairwise_ones_and_say_how_near(
+    room: tuple[list[Scan], Array, Alignment],
+) -> None:
+    _, truth, found = room
+    errors = step_errors(found, truth)
+    joint_m = np.sqrt((errors[:, :3] ** 2).sum(axis=1).mean())
+    assert found.n_parts == 1
+    assert not found.reasons
+    assert not found.part.any()
+    assert joint_m < 0.5 * found.pairwise_rms()[0]
+    assert joint_m < 0.002
+    sigma_m, _ = found.sigmas()
+    assert 0.3 * joint_m < sigma_m < 3.0 * joint_m
+
+
+def test_the_same_recording_gives_the_same_bits_with_any_threads_and_after_an_interrupt(
+    room: tuple[list[Scan], Array, Alignment], tmp_path: Path
+) -> None:
+    scans, _, found = room
+    calls = 0
+
+    def interrupt(done: int, total: int) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 2 * N_SCANS + 3:
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("cello3d_ros.learning.align._SAVE_S", 0.0)
+        with pytest.raises(KeyboardInterrupt):
+            align(Clouds(scans), PIPELINE, folder=tmp_path, progress=interrupt)
+        again = align(Clouds(scans), PIPELINE, folder=tmp_path, n_threads=2)
+    np.testing.assert_array_equal(again.poses, found.poses)
+    np.testing.assert_array_equal(again.covariances, found.covariances)
+    other = Clouds(scans_of(2, true_poses()))
+    with pytest.raises(RecordingError, match="another recording or start; remove it"):
+        align(other, PIPELINE, folder=tmp_path)
+
+
+def test_the_frame_of_the_start_is_kept_and_its_errors_are_not(
+    room: tuple[list[Scan], Array, Alignment],
+) -> None:
+    scans, truth, _ = room
+    M = exp(np.array([100.0, -20.0, 3.0, 0.0, 0.0, 2.0]))
+    rng = np.random.default_rng(3)
+    rough = M @ truth @ exp(rng.normal(size=(N_SCANS, 6)) * np.repeat([0.05, 0.01], 3))
+    start = PoseTrack.of_poses([scan.stamp_ns for scan in scans], rough)
+    found = align(Clouds(scans), PIPELINE, start)
+    np.testing.assert_allclose(found.poses[0], rough[0], atol=1e-9)
+    assert np.abs(step_errors(found, truth)[:, :3]).max() < 0.005
+    assert found.n_contradicted == 0
+
+
+def test_poses_that_contradict_the_clouds_are_counted_and_the_clouds_followed(
+    room: tuple[list[Scan], Array, Alignment],
+) -> None:
+    scans, truth, _ = room
+    wrong = truth.copy()
+    wrong[4:] = truth[4:] @ exp(np.array([0.8, 0.5, 0.0, 0.0, 0.0, 0.4]))
+    start = PoseTrack.of_poses([scan.stamp_ns for scan in scans], wrong)
+    found = align(Clouds(scans), PIPELINE, start)
+    assert found.n_contradicted == 1
+    assert np.abs(step_errors(found, truth)[:, :3]).max() < 0.005
+
+
+def test_two_places_make_two_parts_and_a_stray_scan_is_left_out() -> None:
+    first, second = scans_of(1, true_poses(4)), scans_of(4, true_poses(5), first_ns=10**9)
+    stray = replace(scans_of(9, true_poses(1))[0], stamp_ns=950_000_000)
+    found = align(Clouds([*first, stray, *second]), PIPELINE)
+    assert found.part.tolist() == [1] * 4 + [-1] + [0] * 5
+    assert found.reasons == {4: "holds to none of the scans around it"}
+
+
+def test_empty_and_repeated_scans_are_left_out_by_name(
+    room: tuple[list[Scan], Array, Alignment],
+) -> None:
+    scans, truth, _ = room
+    bad = list(scans)
+    bad[2] = replace(scans[2], points=np.zeros((0, 3)))
+    bad[5] = replace(scans[5], points=scans[4].points)
+    found = align(Clouds(bad), PIPELINE)
+    kept = [0, 1, 3, 4, 6]
+    assert found.members().tolist() == kept
+    assert found.reasons[2].startswith("0 of 0 points are left")
+    assert found.reasons[5] == "repeats the scan before"
+    steps = inverse(found.poses[kept[:-1]]) @ found.poses[kept[1:]]
+    exact = inverse(truth[kept[:-1]]) @ truth[kept[1:]]
+    assert np.abs(log(inverse(exact) @ steps)[:, :3]).max() < 0.005
+
+
+@pytest.mark.parametrize(
+    ("rooms", "sentence"),
+    [
+        ([1, 1], "has 2 scans; aligning needs at least 3"),
+        ([1, 1, 1], "no 3 of the 3 scans of clouds hold to one another"),
+        ([1, 4, 9], "no 3 of the 3 scans of clouds hold to one another"),
+    ],
+)
+def test_nothing_is_made_of_too_few_scans(rooms: list[int], sentence: str) -> None:
+    scans = [
+        replace(scans_of(room, true_poses(1))[0], stamp_ns=(k + 1) * 10**8)
+        for k, room in enumerate(rooms)
+    ]
+    with pytest.raises(RecordingError, match=sentence):
+        align(Clouds(scans), PIPELINE)
+
+
+def test_the_motion_within_scans_is_undone() -> None:
+    truth = true_poses(N_SCANS, step_m=0.5)
+    step = log(inverse(truth[0]) @ truth[1])
+    swept = []
+    for scan in scans_of(1, truth):
+        time_s = np.linspace(0.0, 0.1, len(scan.points))[
+            np.argsort(np.argsort(np.arctan2(scan.points[:, 1], scan.points[:, 0])))
+        ]
+        T = inverse(exp(time_s[:, None] / 0.1 * step))
+        points = np.einsum("nij,nj->ni", T[:, :3, :3], scan.points) + T[:, :3, 3]
+        swept.append(replace(scan, points=points, time_s=time_s))
+    found = align(Clouds(swept), PIPELINE)
+    smeared = align(Clouds([replace(scan, time_s=None) for scan in swept]), PIPELINE)
+    assert found.compensated
+    assert not smeared.compensated
+
+    def worst(alignment: Alignment) -> float:
+        return float(np.abs(step_errors(alignment, truth)[1:-1, :3]).max())
+
+    assert worst(found) < 0.005
+    assert worst(found) < 0.5 * worst(smeared)
