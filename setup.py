@@ -15,6 +15,7 @@ OPEN3D = [
     "open3d>=0.19; platform_machine != 'x86_64'",
 ]
 CSV = ["pyarrow>=15"]  # reads clouds and poses in CSV files; has no rosdep key
+SIMULATION = ["embreex>=4.4; platform_machine == 'x86_64'"]  # ray tracing; needs numpy only
 CLUSTER = ["distributed>=2024.1"]
 SMALL_GICP = ["small_gicp>=1.0"]
 REPORT = ["plotly>=6"]  # maintained; its 3-D views work in one file without a network
@@ -28,6 +29,7 @@ TEST = [
     "mcap>=1.1",
     "mcap-ros2-support>=0.5",
     *CSV,
+    *SIMULATION,
     *CLUSTER,
     *SMALL_GICP,
     *REPORT,
@@ -63,6 +65,7 @@ setup(
         "ros": ROS,
         "open3d": OPEN3D,
         "csv": CSV,
+        "simulation": SIMULATION,
         "cluster": CLUSTER,
         "small_gicp": SMALL_GICP,
         "report": REPORT,

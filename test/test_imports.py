@@ -16,11 +16,17 @@ OF_ROSDEP = {
     "threadpoolctl": "python3-sklearn",
     "llvmlite": "python3-numba",
 }
-NO_KEY = {"pyarrow", "plotly", "small_gicp", "distributed"}  # and needed by few verbs only
+NO_KEY = {
+    "embreex",
+    "pyarrow",
+    "plotly",
+    "small_gicp",
+    "distributed",
+}  # and needed by few verbs only
 
 SCRIPT = """
 import importlib, pkgutil, sys
-for name in ("rclpy", "open3d", "sensor_msgs", "geometry_msgs", "nav_msgs", "diagnostic_msgs"):
+for name in ("rclpy", "open3d", "embreex", "sensor_msgs", "geometry_msgs", "nav_msgs"):
     sys.modules[name] = None  # importing it now raises ImportError
 import cello3d_ros
 for module in pkgutil.walk_packages(cello3d_ros.__path__, "cello3d_ros."):

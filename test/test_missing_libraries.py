@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,11 +10,18 @@ import pytest
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.registration.backends import register
-from cello3d_ros.simulation.scanner import import_open3d
+from cello3d_ros.simulation.casting import Solid
+from cello3d_ros.simulation.meshes import box
+from cello3d_ros.simulation.world_files import PARTS
 
 
 def simulate() -> None:
-    import_open3d("simulated worlds")
+    Solid(box([0, 0, 0], [1, 1, 1]))
+
+
+def read_mesh() -> None:
+    site = SimpleNamespace(folder=Path(__file__).parent)
+    PARTS["mesh"](site, file=Path(__file__).name)
 
 
 def by_open3d() -> None:
@@ -21,7 +29,7 @@ def by_open3d() -> None:
     register(None, None, np.eye(4), config, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("use", [simulate, by_open3d])
+@pytest.mark.parametrize("use", [read_mesh, by_open3d])
 @pytest.mark.parametrize("library", ["libGL.so.1", "libX11.so.6"])
 def test_a_library_without_its_system_libraries_names_the_packages_of_apt(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, library: str, use
@@ -38,9 +46,16 @@ def test_a_library_without_its_system_libraries_names_the_packages_of_apt(
     assert "pip install" not in str(caught.value)
 
 
-@pytest.mark.parametrize("use", [simulate, by_open3d])
-def test_a_library_that_is_not_installed_names_its_extra(monkeypatch, use) -> None:
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(Cello3dError, match=r"pip install 'cello3d_ros\[open3d\]'") as caught:
+@pytest.mark.parametrize(
+    ("use", "module", "extra"),
+    [
+        (simulate, "embreex.mesh_construction", "simulation"),
+        (read_mesh, "open3d", "open3d"),
+        (by_open3d, "open3d", "open3d"),
+    ],
+)
+def test_a_library_that_is_not_installed_names_its_extra(monkeypatch, use, module, extra) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(Cello3dError, match=rf"pip install 'cello3d_ros\[{extra}\]'") as caught:
         use()
     assert "apt-get" not in str(caught.value)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 from cello3d_ros.cli.sources import with_progress
 from cello3d_ros.errors import RecordingError
+from cello3d_ros.simulation.drives import MOTIONS, Drive
+from cello3d_ros.simulation.products import SCANNERS
 from cello3d_ros.simulation.rescan import KEY, told
-from cello3d_ros.simulation.scanner import SCANNERS, Scanner
+from cello3d_ros.simulation.scanner import Scanner
 from cello3d_ros.simulation.simulation import Simulation
 from cello3d_ros.simulation.worlds import WORLDS
 
@@ -23,17 +27,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seeds", type=int, metavar="N", help="N bags OUT/WORLD-SEED, of this and later seeds"
     )
-    parser.add_argument("--scans", type=int, default=25, help="number of scans, 0.5 s apart")
+    parser.add_argument("--scans", type=int, default=25, help="number of scans")
+    parser.add_argument(
+        "--drive",
+        choices=MOTIONS,
+        help="a robot carries the scanner and sweeps while it moves (else a walk, 0.5 s a scan)",
+    )
     parser.add_argument("--path", type=Path, metavar="FILE", help="TUM poses of the sensor")
     parser.add_argument(
-        "--scanner", choices=SCANNERS, default="spinning32", help="kind of lidar (spinning32)"
+        "--scanner",
+        choices=SCANNERS,
+        metavar="NAME",
+        default="spinning32",
+        help=f"lidar (spinning32): {', '.join(SCANNERS)}",
     )
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="change a property of the scanner, such as range_noise_m=0.03",
+        help="change a property of the scanner, such as range_noise_m=0.03, or of the drive, "
+        "such as speed_m_s=8",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="BAG", help="rosbag2 folder to make (mcap)"
@@ -41,16 +55,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Write the bags.  Raises RecordingError if a name is taken or Open3D is missing."""
+    """Write the bags.  Raises RecordingError if a name is taken or embreex is missing."""
     from cello3d_ros.recordings.bag_writer import write_bag
 
-    scanner = changed(SCANNERS[arguments.scanner], arguments.set)
+    scanner, drive = _configured(arguments)
     n_seeds = 1 if arguments.seeds is None else arguments.seeds
     if n_seeds < 1:
         raise RecordingError(f"--seeds must be at least 1: {n_seeds}")
     for seed in range(arguments.seed, arguments.seed + n_seeds):
         simulation = Simulation(
-            str(arguments.world), seed, arguments.scans, scanner, arguments.path
+            str(arguments.world), seed, arguments.scans, scanner, arguments.path, drive=drive
         )
         out = arguments.out if arguments.seeds is None else arguments.out / simulation.name
         progress = with_progress(simulation, len(simulation), simulation.name)
@@ -59,19 +73,46 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"{out}: {len(simulation)} scans of {simulation.name}")
 
 
-def changed(scanner: Scanner, settings: list[str]) -> Scanner:
-    """Return a scanner with some properties changed.  Raises RecordingError or ConfigError."""
-    known = {field.name: getattr(scanner, field.name) for field in fields(scanner)}
+def _configured(arguments: argparse.Namespace) -> tuple[Scanner, Drive | None]:
+    """Return the scanner and the drive with what ``--set`` changes."""
+    scanner = SCANNERS[arguments.scanner]
+    if arguments.drive is None:
+        return changed(scanner, arguments.set), None
+    drive = Drive(motion=arguments.drive)
+    known = {field.name for field in fields(Drive)} - {"motion"}
+    of_drive = [setting for setting in arguments.set if setting.partition("=")[0] in known]
+    rest = [setting for setting in arguments.set if setting not in of_drive]
+    return changed(scanner, rest), changed(drive, of_drive)
+
+
+T = TypeVar("T", Scanner, Drive)
+
+
+def changed(thing: T, settings: list[str]) -> T:
+    """Return a scanner or drive with some properties changed.
+
+    Raises RecordingError or ConfigError.
+    """
+    known = {field.name: getattr(thing, field.name) for field in fields(thing)}
     values = {}
     for setting in settings:
         name, _, text = setting.partition("=")
         if name not in known:
             raise RecordingError(f"--set {setting}: known are {', '.join(known)}")
         try:
-            values[name] = type(known[name])(text)
-        except ValueError:
+            values[name] = _READ[type(known[name])](text)
+        except (ValueError, KeyError):
             raise RecordingError(f"--set {setting}: {text!r} is no number") from None
-    return replace(scanner, **values)
+    return replace(thing, **values)
+
+
+_READ: dict[type, Callable[[str], Any]] = {
+    int: int,
+    float: float,
+    str: str,
+    bool: {"true": True, "false": False}.__getitem__,
+    tuple: lambda text: tuple(float(part) for part in text.split(",")),
+}
 
 
 def _world(text: str) -> str:
@@ -85,6 +126,8 @@ def _command(arguments: argparse.Namespace, seed: int) -> str:
         f"cello3d simulate {shlex.quote(arguments.world)} --seed {seed} --scans {arguments.scans} "
         f"--scanner {arguments.scanner}"
     )
+    if arguments.drive is not None:
+        command += f" --drive {arguments.drive}"
     if arguments.path is not None:
         command += f" --path {shlex.quote(str(arguments.path))}"
     return command + "".join(f" --set {shlex.quote(setting)}" for setting in arguments.set)

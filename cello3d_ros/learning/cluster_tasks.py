@@ -120,7 +120,7 @@ def _owned(scan: Prepared) -> Prepared:
     tree = KdTree._make(np.array(array) for array in cloud.tree)
     arrays = {name: np.array(getattr(cloud, name)) for name in Cloud._fields if name != "tree"}
     if echoes is not None:
-        echoes = Echoes(echoes.scanner, np.array(echoes.distances), np.array(echoes.cosines))
+        echoes = Echoes._make(np.array(v) if isinstance(v, np.ndarray) else v for v in echoes)
     cloud = cloud._replace(tree=tree, **arrays)
     return Prepared(cloud, np.array(T_world_sensor, order="C"), echoes)
 

@@ -16,7 +16,7 @@ from cello3d_ros.recordings import Recording, open_recording
 from cello3d_ros.recordings.challenging import is_challenging, sequence_of
 from cello3d_ros.reproduction.costs import Costs
 from cello3d_ros.reproduction.sequences import SEQUENCES
-from cello3d_ros.simulation.scanner import SCANNERS
+from cello3d_ros.simulation.products import SCANNERS
 from cello3d_ros.simulation.simulation import Simulation
 
 SCANNER = "tilting_hokuyo"  # that of the paper's data

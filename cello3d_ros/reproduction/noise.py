@@ -16,7 +16,7 @@ from cello3d_ros.reproduction import drawing
 from cello3d_ros.reproduction.datasets import SCANNER
 from cello3d_ros.reproduction.result import Result, markdown_table
 from cello3d_ros.reproduction.scenes import censi_of, cube, errors
-from cello3d_ros.simulation.scanner import SCANNERS
+from cello3d_ros.simulation.products import SCANNERS
 from cello3d_ros.simulation.simulation import Simulation
 
 SIGMAS_M = (0.001, 0.002, 0.005, 0.01, 0.02, 0.03, 0.05)

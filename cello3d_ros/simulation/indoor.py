@@ -27,7 +27,7 @@ def rooms(rng: np.random.Generator) -> tuple[Mesh, Route]:
         door = _door(xs, ys, here, following, doors[frozenset((here, following))])
         corners += [door - 0.8 * step, door, door + 0.8 * step]
     route = smooth(_on_floor(corners), closed=True)
-    parts = [_shell(xs[-1], ys[-1], height), *_partitions(xs, ys, height, doors)]
+    parts = [shell(xs[-1], ys[-1], height), *_partitions(xs, ys, height, doors)]
     for i, j in ring:
         low, high = np.array([xs[i], ys[j]]), np.array([xs[i + 1], ys[j + 1]])
         parts += _furniture(low, high, height, route, rng)
@@ -104,7 +104,7 @@ def hall(rng: np.random.Generator) -> tuple[Mesh, Route]:
     radius *= rng.uniform(0.28, 0.33)
     ring = np.stack([length * radius * np.cos(angle), width * radius * np.sin(angle)], axis=1)
     route = smooth(_on_floor(ring + np.array([length / 2, width / 2])), closed=True)
-    parts = [_shell(length, width, height)]
+    parts = [shell(length, width, height)]
     bay = rng.uniform(3.5, 6.0)
     for x in np.arange(bay, length - 1, bay):
         parts.append(block([x - 0.15, 0.0, height - 0.6], [x + 0.15, width, height - 0.2]))
@@ -149,7 +149,7 @@ def corridor(rng: np.random.Generator) -> tuple[Mesh, Route]:
     return join(parts), route
 
 
-def _shell(length: float, width: float, height: float) -> Mesh:
+def shell(length: float, width: float, height: float) -> Mesh:
     """Return floor, ceiling and outer walls of a rectangle that starts at the origin."""
     low, high = [0.0, 0.0], [length, width]
     corners = [low, [length, 0.0], high, [0.0, width]]

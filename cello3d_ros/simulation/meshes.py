@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cello3d_ros.geometry.se3 import Array
+
+_REFLECTANCE = 0.3
 
 _BOX_TRIANGLES = np.array(
     [
@@ -23,10 +25,31 @@ class Mesh:
     """Triangles in space.
 
     vertices: (V, 3), metres.  triangles: (F, 3) indices into the vertices.
+    reflectance: (F,), share of the light that comes back from a triangle that is hit head-on; 0.3
+    where it is not given.
     """
 
     vertices: Array
     triangles: NDArray[np.int64]
+    reflectance: Array | None = None
+
+    def reflectances(self) -> Array:
+        """Return the reflectance (F,) of every triangle."""
+        if self.reflectance is None:
+            return np.full(len(self.triangles), _REFLECTANCE)
+        return self.reflectance
+
+
+def painted(mesh: Mesh, reflectance: float) -> Mesh:
+    """Return the mesh with one reflectance for all its triangles."""
+    return replace(mesh, reflectance=np.full(len(mesh.triangles), float(reflectance)))
+
+
+def moved(mesh: Mesh, place: ArrayLike, yaw_rad: float = 0.0) -> Mesh:
+    """Return the mesh turned by ``yaw_rad`` about the vertical at its origin, then moved."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    turned = mesh.vertices @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    return replace(mesh, vertices=turned + np.asarray(place, dtype=np.float64))
 
 
 def raised(point: ArrayLike, height_m: float) -> Array:
@@ -39,12 +62,14 @@ def join(meshes: Iterable[Mesh]) -> Mesh:
     """Return one mesh with the triangles of all."""
     vertices: list[Array] = [np.zeros((0, 3))]
     triangles: list[NDArray[np.int64]] = [np.zeros((0, 3), dtype=np.int64)]
+    reflectances = [np.zeros(0)]
     n_vertices = 0
     for mesh in meshes:
         vertices.append(mesh.vertices)
         triangles.append(mesh.triangles + n_vertices)
+        reflectances.append(mesh.reflectances())
         n_vertices += len(mesh.vertices)
-    return Mesh(np.concatenate(vertices), np.concatenate(triangles))
+    return Mesh(np.concatenate(vertices), np.concatenate(triangles), np.concatenate(reflectances))
 
 
 def box(center: ArrayLike, size: ArrayLike, yaw_rad: float = 0.0) -> Mesh:

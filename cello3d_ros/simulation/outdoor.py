@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.simulation.meshes import (
@@ -159,7 +159,12 @@ def tree(
 
 def _thinned(leaves: Mesh, share: float) -> Mesh:
     """Return the first of some leaves, which were drawn in no order."""
-    return Mesh(leaves.vertices, leaves.triangles[: round(share * len(leaves.triangles))])
+    return _only(leaves, slice(round(share * len(leaves.triangles))))
+
+
+def _only(mesh: Mesh, rows: NDArray[np.bool_] | slice) -> Mesh:
+    """Return the mesh with some of its triangles."""
+    return Mesh(mesh.vertices, mesh.triangles[rows], mesh.reflectances()[rows])
 
 
 def _pavilion(center: Array, route: Route, rng: np.random.Generator) -> Mesh:
@@ -200,4 +205,4 @@ def clear_of(route: Route, mesh: Mesh) -> Mesh:
     _, nearest = route.nearest(middle[:, :2])
     above = middle[:, 2] - route.points[nearest, 2]
     hit = small & (route.distance(middle[:, :2]) < 0.6) & (above > 0.35) & (above < 2.4)
-    return Mesh(mesh.vertices, mesh.triangles[~hit])
+    return _only(mesh, ~hit)

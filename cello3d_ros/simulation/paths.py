@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +27,37 @@ class Route:
 
     points: Array
     closed: bool
+
+    @cached_property
+    def arc_m(self) -> Array:
+        """Arc length (M,) at each point."""
+        return _arc_length(self.points)
+
+    @cached_property
+    def heading_rad(self) -> Array:
+        """Direction (M,) of the curve in the plane at each point, without jumps of 2 pi.
+
+        Smoothed over a metre.
+        """
+        step = np.diff(self.points[:, :2], axis=0)
+        turned = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+        spacing = self.arc_m[-1] / (len(self.points) - 1)
+        half = min(int(0.5 / spacing), (len(turned) - 1) // 2)
+        if self.closed:
+            lap = 2 * np.pi * np.round((turned[-1] - turned[0]) / (2 * np.pi))
+            turned = np.concatenate(
+                [turned[len(turned) - half :] - lap, turned, turned[: half + 1] + lap]
+            )
+        else:
+            turned = np.pad(turned, (half, half + 1), mode="edge")
+        window = np.ones(2 * half + 1) / (2 * half + 1)
+        return np.convolve(turned, window, mode="valid")
+
+    def at(self, s_m: ArrayLike) -> tuple[Array, Array]:
+        """Return places (..., 3) and headings (...) at arc lengths (...), which start over."""
+        s = np.asarray(s_m, dtype=np.float64) % self.arc_m[-1]
+        places = [np.interp(s, self.arc_m, c) for c in self.points.T]
+        return np.stack(places, axis=-1), np.interp(s, self.arc_m, self.heading_rad)
 
     def distance(self, xy: ArrayLike) -> Array:
         """Return the horizontal distance (...) of points (..., 2) from the curve."""

@@ -13,6 +13,7 @@ import yaml
 from cello3d_ros.errors import Cello3dError, RecordingError
 from cello3d_ros.recordings.opening import open_recording
 from cello3d_ros.recordings.recording import Recording
+from cello3d_ros.simulation.drives import Drive
 from cello3d_ros.simulation.scanner import Scanner
 from cello3d_ros.simulation.simulation import Simulation
 
@@ -29,6 +30,7 @@ def told(simulation: Simulation) -> str:
             "n_scans": simulation.n_scans,
             "scanner": asdict(simulation.scanner),
             "path": None if simulation.path is None else str(simulation.path.resolve()),
+            "drive": None if simulation.drive is None else asdict(simulation.drive),
         }
     )
 
@@ -36,8 +38,9 @@ def told(simulation: Simulation) -> str:
 def rescannable(path: Path | str) -> Recording:
     """Return the recording at a path; one made by ``cello3d simulate`` as its simulation.
 
-    The scans are the same, and have ``echoes``.  Raises RecordingError, also where the simulation
-    no longer gives the scans that were recorded.
+    The scans are the same, and have ``echoes``.  A recording that swept while it moved is returned
+    as it is, as its scans cannot be taken again at one instant.  Raises RecordingError, also where
+    the simulation no longer gives the scans that were recorded.
     """
     recording = open_recording(path)
     text = _custom_data(Path(path)).get(KEY)
@@ -46,9 +49,16 @@ def rescannable(path: Path | str) -> Recording:
     try:
         facts = json.loads(text)
         scanner = Scanner(**facts.pop("scanner"))
-        way = facts.pop("path")
+        way, told_drive = facts.pop("path"), facts.pop("drive", None)
+        drive = None if told_drive is None else Drive(**told_drive)
+        if drive is not None and drive.sweeps:
+            return recording
         simulation = Simulation(
-            **facts, scanner=scanner, path=None if way is None else Path(way), title=recording.name
+            **facts,
+            scanner=scanner,
+            path=None if way is None else Path(way),
+            title=recording.name,
+            drive=drive,
         )
         again, recorded = (next(iter(source)) for source in (simulation, recording))
     except (ValueError, TypeError, KeyError, AttributeError, Cello3dError) as error:

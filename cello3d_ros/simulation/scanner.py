@@ -1,179 +1,238 @@
-"""A lidar scanner: where its beams go, and what comes back of them."""
+"""A lidar scanner: where and when its beams go, and what comes back of them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cello3d_ros.errors import ConfigError, RecordingError, how_to_install
+from cello3d_ros.errors import ConfigError
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.simulation.meshes import Mesh
+
+PATTERNS = ("spinning", "tilting", "rosette", "ring_rosette")
+_PULSE_M = 1.5  # two surfaces nearer than this along a beam give one return between them
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scanner:
-    """Beams and errors of a scanner; a scan is taken at one instant, without motion.
+    """Beams and errors of a scanner, a table of values.
 
-    pattern: "spinning", beams at fixed elevations that turn about the vertical; or "tilting", a
-    fan of beams across (azimuth) that nods about the sensor's y axis through the elevations.
-    range_noise_m: standard deviation of a range.
+    pattern: "spinning", beams at fixed elevations that turn about the vertical; "tilting", a fan
+    of beams across (azimuth) that nods about the sensor's y axis through the elevations;
+    "rosette", ``n_beams`` lines behind two turning prisms, around x; "ring_rosette", lines that
+    swing between the elevations while they turn.  A rosette never repeats itself.
+    elevations_deg: one for each beam of a spinning scanner; else ``n_beams`` of them, evenly from
+    the least to the greatest.
+    azimuth_step_deg, azimuth_span_deg: between the columns of a scan, and of all of them.
+    n_columns: number of columns, where it is not span / step.
+    sweep_s: duration of a scan.  Azimuth (a tilting fan: elevation) grows with time.
+    range_noise_m, range_noise_per_m: standard deviation of a range near the sensor, and what is
+    added to it, in quadrature, per metre of range.
     missing_share: share of the returns that get lost whatever they hit.
     grazing_deg: angle of incidence (0 is head-on) beyond which the chance of a return falls,
     linearly in the cosine, to 0 at 90 degrees.
+    reach_m: range at which a surface of reflectance 0.1 hit head-on still returns.  The light
+    that comes back goes with reflectance, cosine of incidence and range^-2, and the chance of a
+    return with its square.
+    divergence_deg: width of a beam; at an edge it gives points between the two surfaces.
+    particle_share, particle_range_m: share of the beams that rain, snow or dust sends back, and
+    the mean distance, exponential, beyond the least range.
     """
 
     pattern: str = "spinning"
     n_beams: int = 32
     min_elevation_deg: float = -25.0
     max_elevation_deg: float = 15.0
+    elevations_deg: tuple[float, ...] = ()
     azimuth_step_deg: float = 0.6
     azimuth_span_deg: float = 360.0
+    n_columns: int = 0
+    sweep_s: float = 0.1
     min_range_m: float = 0.5
     max_range_m: float = 30.0
     range_noise_m: float = 0.01
+    range_noise_per_m: float = 0.0
     missing_share: float = 0.03
     grazing_deg: float = 80.0
+    reach_m: float = np.inf
+    divergence_deg: float = 0.0
+    particle_share: float = 0.0
+    particle_range_m: float = 2.0
 
     def __post_init__(self) -> None:
+        table = tuple(float(e) for e in self.elevations_deg)
+        object.__setattr__(self, "elevations_deg", table)
         laws = {
-            "pattern": self.pattern in ("spinning", "tilting"),
+            "pattern": self.pattern in PATTERNS,
             "n_beams": self.n_beams >= 1,
             "min_elevation_deg": -90 <= self.min_elevation_deg <= self.max_elevation_deg,
             "max_elevation_deg": self.max_elevation_deg <= 90,
+            "elevations_deg": all(-90 <= e <= 90 for e in table),
             "azimuth_step_deg": 0.01 <= self.azimuth_step_deg <= self.azimuth_span_deg,
             "azimuth_span_deg": self.azimuth_span_deg <= 360,
+            "n_columns": self.n_columns >= 0,
+            "sweep_s": 0 < self.sweep_s <= 60,
             "min_range_m": 0 <= self.min_range_m < self.max_range_m,
             "max_range_m": self.max_range_m <= 10_000,
             "range_noise_m": 0 <= self.range_noise_m <= 10,
+            "range_noise_per_m": 0 <= self.range_noise_per_m <= 1,
             "missing_share": 0 <= self.missing_share <= 1,
             "grazing_deg": 0 <= self.grazing_deg < 90,
+            "reach_m": self.reach_m > 0,
+            "divergence_deg": 0 <= self.divergence_deg <= 10,
+            "particle_share": 0 <= self.particle_share <= 1,
+            "particle_range_m": 0 < self.particle_range_m <= 1000,
         }
         for name, holds in laws.items():
             if not holds:
                 raise ConfigError(f"Scanner.{name} is out of range: {getattr(self, name)}")
 
-    def directions(self) -> Array:
-        """Return the unit vectors (n, 3) of the beams in the sensor frame."""
-        elevation = np.radians(
-            np.linspace(self.min_elevation_deg, self.max_elevation_deg, self.n_beams)
-        )
-        n = max(1, round(self.azimuth_span_deg / self.azimuth_step_deg))
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows (beams, or steps of a tilting fan) and columns of a scan."""
+        columns = self.n_columns or max(1, round(self.azimuth_span_deg / self.azimuth_step_deg))
+        return len(self.elevations_deg) or self.n_beams, columns
+
+    def elevations(self) -> Array:
+        """Return the elevation (rows,) of each beam, in degrees."""
+        if self.elevations_deg:
+            return np.array(self.elevations_deg)
+        return np.linspace(self.min_elevation_deg, self.max_elevation_deg, self.n_beams)
+
+    def times(self) -> Array:
+        """Return when each beam (n,) is sent, in seconds of the sweep, 0 to below ``sweep_s``."""
+        rows, columns = self.shape
+        if self.pattern == "tilting":
+            return self.sweep_s * np.arange(rows * columns) / (rows * columns)
+        return np.tile(self.sweep_s * np.arange(columns) / columns, rows)
+
+    def directions(self, turn: int = 0) -> Array:
+        """Return the unit vectors (n, 3) of the beams of one scan in the sensor frame.
+
+        Row after row.  turn: number of the scan, which changes those of a rosette.
+        """
+        if self.pattern == "rosette":
+            return self._rosette(turn)
+        if self.pattern == "ring_rosette":
+            return self._ring_rosette(turn)
+        n = self.shape[1]
         azimuth = np.radians((np.arange(n) + 0.5) / n - 0.5) * self.azimuth_span_deg
-        e, a = (g.ravel() for g in np.meshgrid(elevation, azimuth, indexing="ij"))
+        e, a = (
+            g.ravel() for g in np.meshgrid(np.radians(self.elevations()), azimuth, indexing="ij")
+        )
         if self.pattern == "tilting":
             ahead = np.cos(a)
             return np.stack([np.cos(e) * ahead, np.sin(a), np.sin(e) * ahead], axis=1)
-        return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1)
+        return _spherical(a, e)
+
+    def _rosette(self, turn: int) -> Array:
+        """Two prisms that turn against each other; the lines stand side by side in azimuth."""
+        rows, columns = self.shape
+        t = turn * self.sweep_s + self.times().reshape(rows, columns)
+        first, second = 2 * np.pi * _PRISMS_HZ[0] * t, 2 * np.pi * _PRISMS_HZ[1] * t
+        line = (np.arange(rows) - (rows - 1) / 2)[:, None] * _LINE_STEP_DEG
+        across = 0.5 * self.azimuth_span_deg - 0.5 * (rows - 1) * _LINE_STEP_DEG
+        up = 0.5 * (self.max_elevation_deg - self.min_elevation_deg)
+        middle = 0.5 * (self.max_elevation_deg + self.min_elevation_deg)
+        a = line + across * 0.5 * (np.cos(first) + np.cos(second))
+        e = middle + up * 0.5 * (np.sin(first) + np.sin(second))
+        return _spherical(np.radians(a.ravel()), np.radians(e.ravel()))
+
+    def _ring_rosette(self, turn: int) -> Array:
+        """Lines that turn about the vertical, each at another phase of one swing up and down."""
+        rows, columns = self.shape
+        t = turn * self.sweep_s + self.times().reshape(rows, columns)
+        swing = (_SWING_HZ * t + np.arange(rows)[:, None] / rows) % 1.0
+        share = 1.0 - np.abs(2.0 * swing - 1.0)
+        e = self.min_elevation_deg + share * (self.max_elevation_deg - self.min_elevation_deg)
+        a = 2 * np.pi * (_TURN_HZ * t + np.arange(rows)[:, None] / rows)
+        return _spherical(a.ravel(), np.radians(e.ravel()))
 
 
-SCANNERS = MappingProxyType(
-    {
-        "spinning16": Scanner(
-            n_beams=16, min_elevation_deg=-15, max_elevation_deg=15, azimuth_step_deg=0.4
-        ),
-        "spinning32": Scanner(),
-        "spinning64": Scanner(
-            n_beams=64, min_elevation_deg=-22.5, max_elevation_deg=22.5, azimuth_step_deg=0.36
-        ),
-        "wide": Scanner(
-            n_beams=90, min_elevation_deg=-50, max_elevation_deg=85, azimuth_step_deg=1.2
-        ),
-        "tilting_hokuyo": Scanner(  # UTM-30LX on a tilting unit, thinned to a quarter
-            pattern="tilting",
-            n_beams=172,
-            min_elevation_deg=-60,
-            max_elevation_deg=60,
-            azimuth_step_deg=0.5,
-            azimuth_span_deg=270,
-            min_range_m=0.1,
-        ),
-        "narrow": Scanner(  # the field of view of a Livox Avia
-            n_beams=110,
-            min_elevation_deg=-38.6,
-            max_elevation_deg=38.6,
-            azimuth_step_deg=0.7,
-            azimuth_span_deg=70.4,
-            max_range_m=100.0,
-            range_noise_m=0.02,
-        ),
-    }
-)
+_PRISMS_HZ = (121.567, -77.733)  # 7294 and -4664 turns a minute
+_LINE_STEP_DEG = 0.7
+_SWING_HZ, _TURN_HZ = 171.31, 10.17
 
 
-def raycasting_scene(mesh: Mesh) -> Any:
-    """Return Open3D's ``RaycastingScene`` of a mesh, ready for ``cast``.
-
-    Raises RecordingError where Open3D cannot be imported.
-    """
-    o3d = import_open3d("simulated worlds")
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(mesh.vertices.astype(np.float32)),
-        o3d.core.Tensor(mesh.triangles.astype(np.uint32)),
-    )
-    return scene
+def _spherical(azimuth: Array, elevation: Array) -> Array:
+    e, a = elevation, azimuth
+    return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1)
 
 
 class Echoes(NamedTuple):
     """What a scan's beams meet, before any error: enough to scan again without the world.
 
     distances: (n,) metres along the beams, inf where there is nothing; cosines: (n,) of the angles
-    of incidence.
+    of incidence.  turn: number of the scan.  reflectances: (n,), or None for 0.3 everywhere.
     """
 
     scanner: Scanner
     distances: Array
     cosines: Array
-
-
-def cast(scene: Any, scanner: Scanner, T_world_sensor: Array) -> Echoes:
-    """Return what the scanner's beams meet from a pose."""
-    o3d = import_open3d("simulated worlds")
-    beams = scanner.directions()
-    rays = np.empty((len(beams), 6), dtype=np.float32)
-    rays[:, :3] = T_world_sensor[:3, 3]
-    rays[:, 3:] = beams @ T_world_sensor[:3, :3].T
-    hits = scene.cast_rays(o3d.core.Tensor(rays))
-    normal = hits["primitive_normals"].numpy().astype(np.float64)
-    cosines = np.abs(np.einsum("ij,ij->i", normal, rays[:, 3:].astype(np.float64)))
-    return Echoes(scanner, hits["t_hit"].numpy().astype(np.float64), cosines)
+    turn: int = 0
+    reflectances: Array | None = None
 
 
 def measure(echoes: Echoes, rng: np.random.Generator, range_noise_m: float | None = None) -> Array:
     """Return the points (N, 3) of one scan in the sensor frame, each a float32 number.
 
-    range = distance + N(0, range_noise_m^2) along the beam, the scanner's own noise if not said; a
-    range outside the scanner's limits, a grazing or a randomly missing return gives no point.
+    A range is the distance along the beam plus Gaussian noise; ``range_noise_m`` stands in for the
+    scanner's own.  A range outside the scanner's limits, a grazing, dark or randomly missing
+    return gives no point.
     """
-    scanner, distance, cosine = echoes
+    return returns(echoes, rng, range_noise_m)[0]
+
+
+def returns(
+    echoes: Echoes, rng: np.random.Generator, range_noise_m: float | None = None
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return the points that ``measure`` returns, and the beam (N,) of each."""
+    scanner, distance, cosine = echoes[:3]
     sigma_m = scanner.range_noise_m if range_noise_m is None else range_noise_m
-    beams = scanner.directions()
-    noise = sigma_m * rng.normal(size=len(beams))
-    luck, gloss = rng.uniform(size=(2, len(beams)))
+    n = len(distance)
+    unit = rng.normal(size=n)
+    luck, gloss = rng.uniform(size=(2, n))
+    chance = np.minimum(1.0, cosine / np.cos(np.radians(scanner.grazing_deg)))
+    if np.isfinite(scanner.reach_m):
+        reflectance = 0.3 if echoes.reflectances is None else echoes.reflectances
+        with np.errstate(divide="ignore"):
+            light = reflectance / 0.1 * cosine * (scanner.reach_m / distance) ** 2
+        chance = np.minimum(chance, light**2)
+    beams = scanner.directions(echoes.turn)
+    if scanner.divergence_deg > 0.0:
+        distance = _mixed(scanner, distance, beams, rng)
+    if scanner.particle_share > 0.0:
+        near = scanner.min_range_m + rng.exponential(scanner.particle_range_m, size=n)
+        hit = (rng.uniform(size=n) < scanner.particle_share) & (near < distance)
+        distance, chance = np.where(hit, near, distance), np.where(hit, 1.0, chance)
+    noise = sigma_m * unit
+    if scanner.range_noise_per_m > 0.0:
+        seen = np.where(np.isfinite(distance), distance, 0.0)
+        noise = np.hypot(sigma_m, scanner.range_noise_per_m * seen) * unit
     kept = (
         (distance + noise >= scanner.min_range_m)
         & (distance + noise <= scanner.max_range_m)
         & (luck >= scanner.missing_share)
-        & (gloss * np.cos(np.radians(scanner.grazing_deg)) <= cosine)
+        & (gloss <= chance)
     )
     points = (distance[kept] + noise[kept])[:, None] * beams[kept]
-    return np.asarray(points.astype(np.float32), dtype=np.float64)
+    return np.asarray(points.astype(np.float32), dtype=np.float64), np.flatnonzero(kept)
 
 
-def scan(scene: Any, scanner: Scanner, T_world_sensor: Array, rng: np.random.Generator) -> Array:
-    """Return the points (N, 3) of one scan as ``measure`` does."""
-    return measure(cast(scene, scanner, T_world_sensor), rng)
+def _mixed(scanner: Scanner, distance: Array, beams: Array, rng: np.random.Generator) -> Array:
+    """Return the distances, some of those at an edge between the surfaces on its two sides.
 
-
-def import_open3d(purpose: str) -> Any:
-    """Return the module ``open3d``; raises RecordingError that says how to get it."""
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise RecordingError(
-            f"{purpose} need Open3D: {how_to_install('open3d', error)}"
-        ) from error
-    return open3d
+    A beam lies across the edge between it and the next of its row as often as it is wide against
+    the angle between the two.
+    """
+    rows = distance.reshape(scanner.shape)
+    following = np.roll(beams.reshape(*scanner.shape, 3), -1, axis=1)
+    step = np.linalg.norm(following - beams.reshape(following.shape), axis=2)
+    beyond = np.roll(rows, -1, axis=1)
+    cut, share = rng.uniform(size=(2, *rows.shape))
+    with np.errstate(invalid="ignore"):  # inf - inf where there is nothing
+        between = beyond - rows
+        hit = (np.abs(between) < _PULSE_M) & (cut * step < np.radians(scanner.divergence_deg))
+    return np.asarray(rows + share * np.where(hit, between, 0.0)).ravel()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,8 +17,11 @@ from cello3d_ros.recordings.odometry import drift_odometry
 from cello3d_ros.recordings.poses import check_order, read_tum
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.recordings.tables import read_bytes
-from cello3d_ros.simulation.paths import walk
-from cello3d_ros.simulation.scanner import SCANNERS, Scanner, cast, measure, raycasting_scene
+from cello3d_ros.simulation.casting import Surroundings, cast
+from cello3d_ros.simulation.drives import Drive, body, trajectory
+from cello3d_ros.simulation.paths import Route, walk
+from cello3d_ros.simulation.products import SCANNERS
+from cello3d_ros.simulation.scanner import Scanner, returns
 from cello3d_ros.simulation.worlds import World, build_world
 
 FIRST_STAMP_NS = 1_600_000_000_000_000_000
@@ -26,14 +30,16 @@ STEP_NS = 500_000_000
 
 @dataclass(frozen=True)
 class Simulation:
-    """A recording that is computed while it is read; all of it follows from the first five.
+    """A recording that is computed while it is read; all of it follows from its fields.
 
-    world: the name of a world, or a YAML file with one.  path: a TUM file with the poses of the
-    sensor and their stamps, instead of a walk along the world's route with a scan each 0.5 s.
+    world: the name of a world, or a YAML file with one.  drive: how a robot carries the scanner
+    along the world's route; None for a walk with a scan each 0.5 s, each taken at one instant.
+    path: a TUM file with the poses of the sensor and their stamps, instead of a route.
     title: what it is called instead of by world and seed.
 
     A scan depends on the seed and on its own number only: a longer simulation starts with the
-    scans of a shorter one.
+    scans of a shorter one.  A scan that sweeps is stamped at its end, its points have times, and
+    it has no echoes, as it cannot be scanned anew without the motion.
     """
 
     world: str
@@ -42,12 +48,15 @@ class Simulation:
     scanner: Scanner = SCANNERS["spinning32"]
     path: Path | None = None
     title: str = ""
+    drive: Drive | None = None
 
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise RecordingError(f"the seed of a simulation must not be negative: {self.seed}")
         if self.n_scans < 1:
             raise RecordingError(f"a simulation needs at least one scan, not {self.n_scans}")
+        if self.path is not None and self.drive is not None:
+            raise RecordingError("a simulation follows a path or a drive, not both")
 
     @property
     def name(self) -> str:
@@ -68,37 +77,102 @@ class Simulation:
         return self.n_scans
 
     def __iter__(self) -> Iterator[Scan]:
-        world, truth, odometry = self.build()
-        scene, stamps = raycasting_scene(world.mesh), self.stamps_ns()
-        for k in range(self.n_scans):
-            echoes = cast(scene, self.scanner, truth[k])
+        built = self._build()
+        world, stamps = built.world, self.stamps_ns()
+        own = body(self.drive) if self.drive is not None and self.drive.body else None
+        around = Surroundings(world.mesh, world.glass, world.movers, own)
+        after = self._times() if self.drive is not None and self.drive.sweeps else None
+        for k, (stamp_ns, T) in enumerate(zip(stamps, built.truth, strict=True)):
+            time_s: Any = 1e-9 * (stamp_ns - stamps[0])
+            if after is None:
+                echoes = cast(around, self.scanner, T, k, time_s)
+            else:
+                T_beams = T @ _at(built.track, stamp_ns, after)
+                echoes = cast(around, self.scanner, T_beams, k, time_s + after)
+            points, beams = returns(echoes, np.random.default_rng([self.seed, k]))
             yield Scan(
-                stamp_ns=stamps[k],
-                points=measure(echoes, np.random.default_rng([self.seed, k])),
-                T_world_sensor=truth[k],
-                T_odom_sensor=odometry[k],
-                echoes=echoes,
+                stamp_ns=stamp_ns,
+                points=points,
+                T_world_sensor=T,
+                T_odom_sensor=built.odometry[k],
+                time_s=None if after is None else after[beams],
+                echoes=echoes if after is None else None,
             )
 
     def track(self) -> PoseTrack:
-        """Return the odometry at the stamps."""
-        return PoseTrack.of_poses(self.stamps_ns(), self.build()[2])
+        """Return the odometry: at the stamps, of a drive each hundredth of a second.
+
+        What it drifts from scan to scan it drifts evenly over the time between.
+        """
+        built, stamps = self._build(), np.array(self.stamps_ns())
+        if self.drive is None:
+            return PoseTrack.of_poses(stamps, built.odometry)
+        first, last = int(stamps[0]), int(stamps[-1])
+        times = np.union1d(built.track.stamps_ns, stamps)
+        times = times[times <= last]
+        after_s = 1e-9 * (times - first)
+        T_odom_world = built.odometry @ se3.inverse(built.truth)
+        drift = PoseTrack.of_poses(stamps, T_odom_world).motion(first, np.maximum(after_s, 0.0))
+        exact = built.truth[0] @ built.track.motion(first, after_s)
+        return PoseTrack.of_poses(times, T_odom_world[0] @ drift @ exact)
+
+    def true_track(self) -> PoseTrack:
+        """Return the exact poses: at the stamps, of a drive each hundredth of a second."""
+        return self._build().track
 
     def stamps_ns(self) -> list[int]:
         """Return the stamps of the scans."""
         if self.path is not None:
             return read_path(self.path, self.n_scans)[0]
-        return [FIRST_STAMP_NS + k * STEP_NS for k in range(self.n_scans)]
+        step = STEP_NS if self.drive is None else 1e9 / self.drive.rate_hz
+        return [FIRST_STAMP_NS + round(k * step) for k in range(self.n_scans)]
 
     def build(self) -> tuple[World, Array, Array]:
         """Return the world, and T_world_sensor and T_odom_sensor, both (n_scans, 4, 4)."""
+        built = self._build()
+        return built.world, built.truth, built.odometry
+
+    def _times(self) -> Array:
+        """Return when each beam (n,) is sent, in seconds after the stamp: none is."""
+        assert self.drive is not None
+        sweep = min(self.scanner.sweep_s, 1.0 / self.drive.rate_hz)
+        return self.scanner.times() * (sweep / self.scanner.sweep_s) - sweep
+
+    def _build(self) -> _Built:
         layout, way, drift = np.random.default_rng(self.seed).spawn(3)
-        world = build_world(self.world, layout)
-        if self.path is not None:
-            truth = read_path(self.path, self.n_scans)[1]
+        world, stamps = build_world(self.world, layout), self.stamps_ns()
+        if self.drive is not None:
+            track = _driven(world.route, self.drive, stamps, float(self._times().min()), way)
+            truth = np.stack([T for s in stamps if (T := track.at(s)) is not None])
         else:
-            truth = walk(world.route, self.n_scans, way.uniform(0.9, 1.5), way)
-        return world, truth, drift_odometry(truth, drift)
+            if self.path is not None:
+                truth = read_path(self.path, self.n_scans)[1]
+            else:
+                truth = walk(world.route, self.n_scans, way.uniform(0.9, 1.5), way)
+            track = PoseTrack.of_poses(stamps, truth)
+        return _Built(world, track, truth, drift_odometry(truth, drift))
+
+
+class _Built(NamedTuple):
+    world: World
+    track: PoseTrack  # exact, at least at the stamps
+    truth: Array
+    odometry: Array
+
+
+def _driven(
+    route: Route, drive: Drive, stamps: list[int], start_s: float, rng: np.random.Generator
+) -> PoseTrack:
+    """Return the exact poses of a drive from the start of the first sweep to the last stamp."""
+    end_s = 1e-9 * (stamps[-1] - stamps[0])
+    times, poses = trajectory(route, drive, start_s, end_s, rng)
+    return PoseTrack.of_poses(stamps[0] + np.round(1e9 * times).astype(np.int64), poses)
+
+
+def _at(track: PoseTrack, stamp_ns: int, after_s: Array) -> Array:
+    """Return ``track.motion``, computed once for times that are alike."""
+    times, which = np.unique(after_s, return_inverse=True)
+    return track.motion(stamp_ns, times)[which]
 
 
 def read_path(path: Path, n_scans: int) -> tuple[list[int], Array]:

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from cello3d_ros.errors import RecordingError
+from cello3d_ros.errors import RecordingError, how_to_install
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.simulation.meshes import Mesh, block, box, frustum, join, raised, terrain
 from cello3d_ros.simulation.outdoor import Ground, clear_of, places, tree, uneven_ground
 from cello3d_ros.simulation.paths import Route, smooth
-from cello3d_ros.simulation.scanner import import_open3d
 
 MAX_TRIANGLES = 20_000_000
 
@@ -193,7 +192,7 @@ def _mesh(site: _Site, file: str, scale: Any = 1.0, at: Any = (0.0, 0.0, 0.0)) -
     path = site.folder / str(file)
     if not path.is_file():
         raise RecordingError(f"{path}: no such file")
-    o3d = import_open3d("mesh files")
+    o3d = _open3d()
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         found = o3d.io.read_triangle_mesh(str(path))
     vertices, triangles = np.asarray(found.vertices), np.asarray(found.triangles)
@@ -201,6 +200,16 @@ def _mesh(site: _Site, file: str, scale: Any = 1.0, at: Any = (0.0, 0.0, 0.0)) -
         raise RecordingError(f"{path}: holds no triangle")
     moved = vertices * _positive(scale, "scale") + _vector(at, "at")
     return Mesh(moved, triangles.astype(np.int64))
+
+
+def _open3d() -> Any:
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise RecordingError(
+            f"mesh files need Open3D: {how_to_install('open3d', error)}"
+        ) from error
+    return open3d
 
 
 PARTS: dict[str, Callable[..., Mesh]] = {

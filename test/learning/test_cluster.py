@@ -172,7 +172,7 @@ def test_workers_keep_blas_to_one_thread(recording, cluster):
 
 @pytest.mark.parametrize("ship", [False, True])
 def test_simulated_worlds_are_scanned_anew_as_on_one_machine(tmp_path, cluster, ship):
-    pytest.importorskip("open3d")
+    pytest.importorskip("embreex")
     folder, config = tmp_path / "bag", tmp_path / "config.yaml"
     config.write_text(CONFIG)
     flags = ["--seed", "2", "--scans", "2", "--scanner", "spinning16"]

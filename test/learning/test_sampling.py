@@ -21,7 +21,8 @@ from cello3d_ros.learning.sampling import (
     stops,
 )
 from cello3d_ros.recordings.recording import Scan
-from cello3d_ros.simulation.scanner import SCANNERS, Echoes, measure
+from cello3d_ros.simulation.products import SCANNERS
+from cello3d_ros.simulation.scanner import Echoes, measure
 
 PIPELINE = Pipeline(
     cloud=CloudConfig(voxel_m=0.1),

@@ -435,7 +435,7 @@ def test_the_demo_bag_is_whole_small_and_what_its_command_says() -> None:
 
 
 def test_the_demo_bag_comes_from_its_seed() -> None:
-    pytest.importorskip("open3d")
+    pytest.importorskip("embreex")
     from cello3d_ros.simulation.simulation import simulate
 
     folder = Path(__file__).parents[2] / "bags" / "demo"

@@ -59,7 +59,7 @@ def test_registrations_lock_on_to_the_next_pillars() -> None:
 
 
 def test_sampled_covariance_and_censi_grow_with_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("open3d")
+    pytest.importorskip("embreex")
     monkeypatch.setattr(noise, "SIGMAS_M", (0.005, 0.05))
     result = noise.make(50, 2, 0)
     found = {(r["scene"], r["sigma_m"], r["block"]): r for r in result.data["rows"]}

@@ -1,16 +1,19 @@
 """``cello3d simulate``: a bag from a seed, through the verb's own arguments."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cello3d_ros.cli import simulate as verb
-from cello3d_ros.errors import RecordingError, WriteError
+from cello3d_ros.errors import ConfigError, RecordingError, WriteError
 from cello3d_ros.recordings import open_recording
-from cello3d_ros.simulation.scanner import SCANNERS
-from cello3d_ros.simulation.simulation import simulate
+from cello3d_ros.simulation.drives import Drive
+from cello3d_ros.simulation.products import SCANNERS
+from cello3d_ros.simulation.rescan import rescannable
+from cello3d_ros.simulation.simulation import Simulation, simulate
 
 
 def parsed(*words: str) -> argparse.Namespace:
@@ -20,7 +23,7 @@ def parsed(*words: str) -> argparse.Namespace:
 
 
 def test_the_bag_holds_the_simulation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("open3d")
+    pytest.importorskip("embreex")
     out = tmp_path / "new" / "bag"
     words = ["corridor", "--seed", "4", "--scans", "3", "--scanner", "spinning16"]
     verb.run(parsed(*words, "--out", str(out)))
@@ -54,3 +57,48 @@ def test_values_out_of_range_are_errors(words: list[str], tmp_path: Path) -> Non
 def test_a_taken_name_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(WriteError, match="exists already"):
         verb.run(parsed("rooms", "--out", str(tmp_path)))
+
+
+def test_a_drive_is_told_and_its_points_carry_times(tmp_path: Path) -> None:
+    pytest.importorskip("embreex")
+    words = ["tunnel", "--scans", "2", "--drive", "reverse", "--scanner", "vlp16"]
+    words += ["--set", "speed_m_s=4", "--set", "rate_hz=20", "--set", "azimuth_step_deg=2"]
+    verb.run(parsed(*words, "--out", str(tmp_path / "bag")))
+    drive = Drive(motion="reverse", speed_m_s=4.0, rate_hz=20.0)
+    scanner = replace(SCANNERS["vlp16"], azimuth_step_deg=2.0)
+    made = Simulation("tunnel", 0, 2, scanner, drive=drive)
+    recording = open_recording(tmp_path / "bag")
+    for kept, scan in zip(recording, made, strict=True):
+        assert np.array_equal(kept.points, scan.points)
+        assert np.allclose(kept.time_s, scan.time_s, atol=1e-9)
+    metadata = (tmp_path / "bag" / "metadata.yaml").read_text()
+    assert "--drive reverse" in " ".join(metadata.split())  # the file folds long lines
+    assert type(rescannable(tmp_path / "bag")) is type(recording)  # its motion is in the scans
+
+
+def test_a_frozen_drive_can_be_scanned_anew(tmp_path: Path) -> None:
+    pytest.importorskip("embreex")
+    words = ["tunnel", "--scans", "2", "--drive", "forward", "--scanner", "mid360"]
+    verb.run(parsed(*words, "--set", "sweeps=false", "--out", str(tmp_path / "bag")))
+    again = rescannable(tmp_path / "bag")
+    assert isinstance(again, Simulation)
+    for kept, scan in zip(open_recording(tmp_path / "bag"), again, strict=True):
+        assert kept.time_s is None
+        assert np.array_equal(kept.points, scan.points)
+        assert scan.echoes is not None
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("speed_m_s=-1", "Drive.speed_m_s is out of range"),
+        ("sweeps=maybe", "'maybe' is no number"),
+        ("elevations_deg=1,b", "is no number"),
+        ("reach_m=0", "Scanner.reach_m is out of range"),
+    ],
+)
+def test_wrong_properties_are_one_sentence(setting: str, message: str, tmp_path: Path) -> None:
+    words = ["tunnel", "--drive", "forward", "--set", setting, "--out", str(tmp_path / "bag")]
+    with pytest.raises((RecordingError, ConfigError), match=message) as caught:
+        verb.run(parsed(*words))
+    assert "\n" not in str(caught.value)
