@@ -17,7 +17,7 @@ import numpy as np
 
 from cello3d_ros.config import TrainingConfig
 from cello3d_ros.learning.examples import Examples
-from cello3d_ros.learning.training import train
+from cello3d_ros.learning.training import fit
 
 
 def main() -> None:
@@ -40,7 +40,7 @@ def main() -> None:
             max_iterations=arguments.iterations,
         )
         begin, used = time.perf_counter(), time.process_time()
-        training = train(examples, config)
+        training = fit(examples, config)
         report[theta] = {
             "iterations": training.n_iterations,
             "seconds": round(time.perf_counter() - begin, 2),

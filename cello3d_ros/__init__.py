@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from cello3d_ros.covariance.model import Model as Model
     from cello3d_ros.covariance.model import load_model as load_model
     from cello3d_ros.errors import Cello3dError as Cello3dError
+    from cello3d_ros.evaluation.evaluate import EvaluationSettings as EvaluationSettings
+    from cello3d_ros.evaluation.evaluate import evaluate as evaluate
+    from cello3d_ros.learning.sample import sample as sample
+    from cello3d_ros.learning.train import train as train
     from cello3d_ros.recordings.files import read_cloud as read_cloud
     from cello3d_ros.recordings.opening import open_recording as open_recording
 
@@ -34,6 +38,10 @@ _MODULES = {
     "load_model": "covariance.model",
     "read_cloud": "recordings.files",
     "open_recording": "recordings.opening",
+    "sample": "learning.sample",
+    "train": "learning.train",
+    "evaluate": "evaluation.evaluate",
+    "EvaluationSettings": "evaluation.evaluate",
     "Cello3dError": "errors",
 }
 __all__ = ["__version__", *_MODULES]

@@ -55,15 +55,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--runs", type=_positive, default=100, metavar="N", help="odometries of a sequence (100)"
     )
+    parser.add_argument("--seed", type=int, default=0, help="of every random draw")
+    parser.add_argument(
+        "--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N", help="threads"
+    )
+    _add_places(parser)
+
+
+def _add_places(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--data",
         type=Path,
         metavar="FOLDER",
         help="the paper's own sequences, folders or zip archives, in place of simulated ones",
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of every random draw")
-    parser.add_argument(
-        "--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N", help="threads"
     )
     parser.add_argument(
         "--results",

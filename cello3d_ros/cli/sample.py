@@ -10,16 +10,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cello3d_ros.config import Config, SamplingConfig, load_config, pipeline_of
 from cello3d_ros.errors import ConfigError
 
 if TYPE_CHECKING:
-    from cello3d_ros.learning.dataset import Dataset, PairRecord
+    from cello3d_ros.learning.dataset import PairRecord
+    from cello3d_ros.learning.sample import Sampler, Status
+    from cello3d_ros.learning.sampling import Progress
     from cello3d_ros.recordings.recording import Recording
-
-    Sampler = Callable[[Recording, list[tuple[int, int]]], Iterator[PairRecord]]
 
 _PRECISION = 0.05  # of ``--samples adaptive``: 800 Gaussian samples reach it
 _BLOCK = 1000  # registrations of one task: docs/cluster.md says why
@@ -67,88 +67,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Sample what is missing; the same command finishes what was interrupted."""
-    from threadpoolctl import threadpool_limits
-
-    from cello3d_ros.learning.dataset import open_dataset
-    from cello3d_ros.learning.identity import fingerprint, scan_prints
-    from cello3d_ros.recordings import open_recording
-    from cello3d_ros.simulation.rescan import rescannable
-    from cello3d_ros.simulation.simulation import Simulation
+    from cello3d_ros.learning.sample import sample
 
     config = load_config(arguments.config) if arguments.config else Config()
-    sampling = _sampling(config, arguments)
-    pipeline = pipeline_of(config)
-    opened = rescannable if sampling.noise_m > 0.0 else open_recording
-    recordings = [opened(Path(path)) for path in arguments.recordings]
-    names = Counter(recording.name for recording in recordings)
-    if twice := [name for name, n in names.items() if n > 1]:
-        raise ConfigError(f"two recordings are named {twice[0]!r}: their pairs would mix")
-    paths = dict(zip(names, arguments.recordings))
-    with _progress() as bar, _sampler(arguments, pipeline, sampling, paths, bar) as sampler:
-        dataset = open_dataset(arguments.out, pipeline, sampling, create=True)
-        for recording in recordings:
-            bar.set_description(f"reading {recording.name}")
-            facts: dict[str, Any] = {"n_scans": len(recording)}
-            facts["fingerprint"] = fingerprint(recording)
-            known = dataset.recordings.get(recording.name, {})
-            if scans := known.get("scans") or scan_prints(recording):
-                facts["scans"] = scans
-            if sampling.noise_m > 0.0:
-                facts["noise"] = "rescans" if isinstance(recording, Simulation) else "added"
-            dataset.add_recording(recording.name, facts)
-        try:
-            with threadpool_limits(1, user_api="blas"):  # its threads take the kernels' cores
-                outcomes = _sample(recordings, dataset, sampler, bar, arguments.jobs)
-        except SystemError as error:  # what CPython makes of Ctrl-C in a compiled kernel
-            if isinstance(error.__cause__, KeyboardInterrupt):
-                raise error.__cause__ from None
-            raise
+    config = replace(config, sampling=_sampling(config, arguments))
+    with _progress() as report, _sampler(arguments, config) as sampler:
+        outcomes = sample(
+            arguments.recordings, arguments.out, config, arguments.jobs, report, sampler
+        )
     print(f"{arguments.out}: {_summary(outcomes)}")
 
 
-def _sample(
-    recordings: list[Recording], dataset: Dataset, sampler: Sampler, bar: Any, n_threads: int
-) -> Counter[str]:
-    """Sample what is missing of all recordings; return how often each outcome occurs."""
-    from cello3d_ros.learning.pairs import pairs
-
-    n_samples = dataset.sampling.n_samples
-    outcomes: Counter[str] = Counter()
-    todo = {}
-    bar.set_description("checking what is done")
-    for recording in recordings:
-        wanted = pairs(len(recording), dataset.sampling.max_gap)
-        done = dataset.outcomes(recording.name, wanted, n_threads)
-        outcomes.update(done.values())
-        todo[recording.name] = [ij for ij in wanted if ij not in done]
-    n_pairs = sum(outcomes.values()) + sum(map(len, todo.values()))
-    bar.reset(total=n_samples * sum(map(len, todo.values())))
-    for recording in recordings:
-        bar.set_description(recording.name)
-        bar.set_postfix_str(f"pair {sum(outcomes.values())} of {n_pairs}")
-        for record in sampler(recording, todo[recording.name]):
-            dataset.write(record)
-            outcomes[record.reason] += 1
-            bar.total -= n_samples - record.n_samples  # a rejected pair or one that ended early
-            bar.set_postfix_str(f"pair {sum(outcomes.values())} of {n_pairs}")
-    return outcomes
-
-
 @contextmanager
-def _sampler(
-    arguments: argparse.Namespace,
-    pipeline: Any,
-    sampling: SamplingConfig,
-    paths: dict[str, str],
-    bar: Any,
-) -> Iterator[Sampler]:
-    """Give the function that samples some pairs of a recording, here or on a cluster."""
+def _sampler(arguments: argparse.Namespace, config: Config) -> Iterator[Sampler | None]:
+    """Give the function that samples some pairs of a recording on a cluster, if one is named."""
     if not arguments.scheduler:
-        from cello3d_ros.learning.sampling import sample_recording
-
-        yield lambda recording, todo: sample_recording(
-            recording, todo, pipeline, sampling, arguments.jobs, bar.update
-        )
+        yield None
         return
     if arguments.block < 1:
         raise ConfigError(f"--block must be at least 1: {arguments.block}")
@@ -160,29 +94,42 @@ def _sampler(
     with connected(arguments.scheduler) as client:
         if not client.nthreads():
             print(f"cello3d: {arguments.scheduler} has no worker yet, waiting", file=sys.stderr)
-        yield lambda recording, todo: sample_recording_on(
-            client,
-            recording,
-            todo,
-            Job(
+
+        def there(
+            recording: Recording, path: str, todo: list[tuple[int, int]], progress: Progress
+        ) -> Iterator[PairRecord]:
+            job = Job(
                 name=recording.name,
-                path=str(Path(paths[recording.name]).resolve()),
-                pipeline=pipeline,
-                sampling=sampling,
-            ),
-            arguments.block,
-            arguments.ship_clouds,
-            bar.update,
-        )
+                path=str(Path(path).resolve()),
+                pipeline=pipeline_of(config),
+                sampling=config.sampling,
+                block=arguments.block,
+                ship_clouds=arguments.ship_clouds,
+            )
+            return sample_recording_on(client, recording, todo, job, progress)
+
+        yield there
 
 
-def _progress() -> Any:
-    """Return a bar that counts registrations, with their rate and the time left."""
+@contextmanager
+def _progress() -> Iterator[Callable[[Status], None]]:
+    """Give a bar that counts registrations, with their rate and the time left."""
     from tqdm import tqdm
 
-    return tqdm(
+    with tqdm(
         total=0, unit="reg", unit_scale=True, disable=not sys.stderr.isatty(), smoothing=0.1
-    )
+    ) as bar:
+        what = ""
+
+        def show(status: Status) -> None:
+            nonlocal what
+            bar.total = status.n_total
+            bar.set_postfix_str(f"pair {status.n_pairs} of {status.n_pairs_total}", refresh=False)
+            bar.set_description(status.what, refresh=status.what != what)
+            what = status.what
+            bar.update(status.n_registrations - bar.n)
+
+        yield show
 
 
 def _sampling(config: Config, arguments: argparse.Namespace) -> SamplingConfig:

@@ -80,22 +80,20 @@ def sample_recording_on(
     recording: Recording,
     todo: list[tuple[int, int]],
     job: Job,
-    block: int,
-    ship_clouds: bool = False,
     progress: Progress = lambda n: None,
 ) -> Iterator[PairRecord]:
     """Sample pairs (i, j) of a recording on a cluster; records come in the order of their ends.
 
-    block: registrations of one task; with ``precision`` a pair is one task, as its end depends on
-    what was found.  The workers read the recording at ``job.path``; with ``ship_clouds`` the
-    client reads it and sends each scan to one worker, from which others get its cloud.
+    With ``precision`` a pair is one task, as its end depends on what was found.  The workers read
+    the recording at ``job.path``; with ``job.ship_clouds`` the client reads it and sends each scan
+    to one worker, from which others get its cloud.
     Raises RecordingError as ``sample_recording`` does, and ClusterError: after what is under way
     and can be finished.
     """
-    under_way = _UnderWay(client, job, block)
+    under_way = _UnderWay(client, job)
     finished = import_module("distributed").as_completed(loop=client.loop)
     try:
-        for futures in under_way.submitted(recording, todo, ship_clouds):
+        for futures in under_way.submitted(recording, todo):
             finished.update(futures)
             while not under_way.error and under_way.n_tasks >= under_way.limit():
                 yield from under_way.ended(finished, progress)
@@ -112,8 +110,8 @@ def sample_recording_on(
 class _UnderWay:
     """The tasks that the cluster has been given and that have not come back."""
 
-    def __init__(self, client: Client, job: Job, block: int) -> None:
-        self.client, self.job, self.block = client, job, block
+    def __init__(self, client: Client, job: Job) -> None:
+        self.client, self.job = client, job
         self._ends: dict[str, tuple[str, int, bool]] = {}  # key -> pair, registrations, is last
         self._parts: dict[str, list[Future]] = {}  # pair -> tasks to be kept until its last ends
         self._told: Counter[str] = Counter()  # pair -> registrations of which progress knows
@@ -132,12 +130,12 @@ class _UnderWay:
         return max(_FEWEST_UNDER_WAY, _UNDER_WAY_PER_THREAD * n_threads)
 
     def submitted(
-        self, recording: Recording, todo: list[tuple[int, int]], ship_clouds: bool
+        self, recording: Recording, todo: list[tuple[int, int]]
     ) -> Iterator[list[Future]]:
         """Submit pair by pair in the order of j; yield the tasks of each that report an end."""
         by_reading = {j: [i for i, reading in todo if reading == j] for _, j in todo}
         needed = {index for ij in todo for index in ij}
-        scans = iter(recording) if ship_clouds else None
+        scans = iter(recording) if self.job.ship_clouds else None
         clouds: dict[int, Future] = {}
         for j in range(max(needed, default=-1) + 1):
             clouds.pop(j - self.job.sampling.max_gap - 1, None)
@@ -192,7 +190,7 @@ class _UnderWay:
             parts = [self._submit(f"pair-{pair}", whole_pair, self.job, i, j, *clouds)]
             n_done = [0]
         else:
-            cuts = [*range(0, sampling.n_samples, self.block), sampling.n_samples]
+            cuts = [*range(0, sampling.n_samples, self.job.block), sampling.n_samples]
             n_done = [*(b - a for a, b in pairwise(cuts)), 0]
             record = self._submit(f"described-{pair}", described, self.job, i, j, *clouds)
             parts = [

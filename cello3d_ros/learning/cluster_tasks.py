@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import uuid
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache, lru_cache
 
 import numpy as np
@@ -22,14 +22,15 @@ from cello3d_ros.learning.dataset import PairRecord, package_versions
 from cello3d_ros.learning.sampling import (
     PENDING,
     Block,
+    Pair,
     Prepared,
-    both_echoes,
     check_complete,
-    describe_prepared,
+    describe_pair,
     finish_pair,
+    pair_of,
     prepare_scan,
     register_block,
-    sample_prepared,
+    sample_pair,
 )
 from cello3d_ros.recordings import open_recording
 from cello3d_ros.recordings.recording import Scan
@@ -48,13 +49,16 @@ class Job:
     """What all tasks of one recording share.
 
     run: unlike in any other run, part of every key; path: where the workers find the recording;
-    versions: of the client's packages, which the workers must have too.
+    versions: of the client's packages, which the workers must have too; block: registrations of
+    one task; ship_clouds: whether the client reads the recording and sends each scan.
     """
 
     name: str
     path: str
     pipeline: Pipeline
     sampling: SamplingConfig
+    block: int = 1000
+    ship_clouds: bool = False
     run: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
     versions: tuple[tuple[str, str], ...] = field(
         default_factory=lambda: tuple(package_versions().items())
@@ -72,9 +76,7 @@ def prepared(job: Job, index: int, scan: Scan | None) -> Prepared:
 def described(job: Job, i: int, j: int, reference: Prepared, reading: Prepared) -> PairRecord:
     """Task: all of a record but the samples."""
     _one_blas_thread()
-    return describe_prepared(
-        job.name, i, j, _owned(reference), _owned(reading), job.pipeline, job.sampling
-    )
+    return describe_pair(_pair(job, i, j, reference, reading), job.pipeline, job.sampling)
 
 
 def registered(
@@ -83,13 +85,11 @@ def registered(
     """Task: some registrations of a pair, none of a pair that is rejected already."""
     _one_blas_thread()
     _check_versions(job.versions)
-    reference, reading = _owned(reference), _owned(reading)
-    Q, P = reference.cloud, reading.cloud
-    if record.reason != PENDING or isinstance(P, CloudError) or isinstance(Q, CloudError):
+    if record.reason != PENDING:
         return None
-    record = replace(record, T_mean=np.array(record.T_mean, order="C"))
-    echoes = both_echoes(reference, reading)
-    return register_block(record, P, Q, job.pipeline, job.sampling, start, stop, echoes=echoes)
+    pair = _pair(job, record.i, record.j, reference, reading)
+    pair = pair._replace(T_mean=np.array(record.T_mean, order="C"))
+    return register_block(pair, job.pipeline, job.sampling, start, stop)
 
 
 def finished_pair(job: Job, record: PairRecord, blocks: list[Block | None]) -> PairRecord:
@@ -103,9 +103,11 @@ def whole_pair(job: Job, i: int, j: int, reference: Prepared, reading: Prepared)
     """Task: all of a pair whose number of registrations is not known beforehand."""
     _one_blas_thread()
     _check_versions(job.versions)
-    return sample_prepared(
-        job.name, i, j, _owned(reference), _owned(reading), job.pipeline, job.sampling
-    )
+    return sample_pair(_pair(job, i, j, reference, reading), job.pipeline, job.sampling)
+
+
+def _pair(job: Job, i: int, j: int, reference: Prepared, reading: Prepared) -> Pair:
+    return pair_of(job.name, i, j, _owned(reference), _owned(reading))
 
 
 def _owned(scan: Prepared) -> Prepared:

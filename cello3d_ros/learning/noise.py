@@ -5,8 +5,6 @@ Source: the sampled covariances of Bengtsson & Baerveldt 2003 and Iversen et al.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,61 +17,48 @@ from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.backends import register
 from cello3d_ros.registration.icp import Registration
 from cello3d_ros.simulation.scanner import Echoes, measure
-from cello3d_ros.threads import in_threads
 
 
-def register_many_noisy(
+def register_noisy(
     reading: Cloud,
     reference: Cloud,
-    T_inits: Array,
-    seeds: Sequence[Sequence[int]],
+    T_init: Array,
     config: IcpConfig,
     sigma_m: float,
-    n_threads: int = 1,
-) -> list[Registration]:
-    """Register from many starts, each with subsamples and range noise of its own.
+    rng: np.random.Generator,
+) -> Registration:
+    """Register with subsamples and range noise drawn anew.
 
-    T_inits: (n, 4, 4); seeds: n seeds of numpy's default generator.  The subsamples are those
-    that the same seeds draw without noise; sigma_m is the standard deviation of the noise.
+    The subsamples are those that the same generator draws without noise; sigma_m is the standard
+    deviation of the noise.
     """
-
-    def one(k: int) -> Registration:
-        rng = np.random.default_rng(seeds[k])
-        read = subsample(len(reading.points), config.n_reading_points, rng)
-        ref = subsample(len(reference.points), config.n_reference_points, rng)
-        P, Q = noisy(reading, read, sigma_m, rng), noisy(reference, ref, sigma_m, rng)
-        return register(P, Q, T_inits[k], config, rng)
-
-    return in_threads(one, range(len(T_inits)), n_threads)
+    read = subsample(len(reading.points), config.n_reading_points, rng)
+    ref = subsample(len(reference.points), config.n_reference_points, rng)
+    P, Q = noisy(reading, read, sigma_m, rng), noisy(reference, ref, sigma_m, rng)
+    return register(P, Q, T_init, config, rng)
 
 
-def register_many_rescanned(
-    reference: Echoes,
+def register_rescanned(
     reading: Echoes,
-    T_inits: Array,
-    seeds: Sequence[Sequence[int]],
+    reference: Echoes,
+    T_init: Array,
     pipeline: Pipeline,
     sigma_m: float,
-    n_threads: int = 1,
-) -> list[Registration]:
-    """Register from many starts, each with both clouds scanned and prepared anew.
+    rng: np.random.Generator,
+) -> Registration:
+    """Register with both clouds scanned and prepared anew.
 
     Ranges, missing returns, filters, normals and subsamples are those of this registration alone.
     A scan that leaves no cloud gives the start, with the reason "too_few_points".
     """
-
-    def one(k: int) -> Registration:
-        rng = np.random.default_rng(seeds[k])
-        try:
-            P, Q = (
-                prepare(measure(echoes, rng, sigma_m), pipeline.cloud, rng)
-                for echoes in (reading, reference)
-            )
-        except CloudError:
-            return Registration(T_inits[k], 0, False, "too_few_points", np.inf, 0)
-        return register(P, Q, T_inits[k], pipeline.icp, rng)
-
-    return in_threads(one, range(len(T_inits)), n_threads)
+    try:
+        P, Q = (
+            prepare(measure(echoes, rng, sigma_m), pipeline.cloud, rng)
+            for echoes in (reading, reference)
+        )
+    except CloudError:
+        return Registration(T_init, 0, False, "too_few_points", np.inf, 0)
+    return register(P, Q, T_init, pipeline.icp, rng)
 
 
 def noisy(

@@ -24,11 +24,12 @@ from cello3d_ros.geometry.gaussian import is_positive_definite, sampled_covarian
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log
 from cello3d_ros.learning.clustering import nearest_cluster, offset
 from cello3d_ros.learning.dataset import PairRecord
-from cello3d_ros.learning.noise import register_many_noisy, register_many_rescanned
-from cello3d_ros.learning.precision import eigenvalue_errors
+from cello3d_ros.learning.noise import register_noisy, register_rescanned
 from cello3d_ros.recordings.recording import Recording, Scan
 from cello3d_ros.registration.backends import register, register_many
+from cello3d_ros.registration.icp import Registration
 from cello3d_ros.simulation.scanner import Echoes
+from cello3d_ros.threads import in_threads
 
 PENDING = "not_sampled"  # the reason of a record that is described and no more
 BLOCK = 500  # registrations between two reports of progress
@@ -46,6 +47,38 @@ class Prepared(NamedTuple):
     echoes: Echoes | None = None
 
 
+class Pair(NamedTuple):
+    """Scans j, the reading, and i, the reference, of a recording.  T_mean: true T_ref_read."""
+
+    recording: str
+    i: int
+    j: int
+    reading: Prepared
+    reference: Prepared
+    T_mean: Array
+
+    def clouds(self) -> tuple[Cloud, Cloud]:
+        """Return reading and reference.  Raises CloudError where one has no cloud."""
+        P, Q = self.reading.cloud, self.reference.cloud
+        if isinstance(P, CloudError):
+            raise P
+        if isinstance(Q, CloudError):
+            raise Q
+        return P, Q
+
+    def echoes(self) -> tuple[Echoes, Echoes] | None:
+        """Return those of reading and reference, or None where one cannot be scanned again."""
+        if self.reading.echoes is None or self.reference.echoes is None:
+            return None
+        return self.reading.echoes, self.reference.echoes
+
+
+def pair_of(recording: str, i: int, j: int, reference: Prepared, reading: Prepared) -> Pair:
+    """Return a pair of prepared scans."""
+    T_mean = np.ascontiguousarray(inverse(reference.T_world_sensor) @ reading.T_world_sensor)
+    return Pair(recording, i, j, reading, reference, T_mean)
+
+
 class Block(NamedTuple):
     """What some of a pair's registrations found.
 
@@ -55,6 +88,16 @@ class Block(NamedTuple):
     xi: Array
     n_converged: int
     n_failed: int
+
+
+def pairs(n_scans: int, max_gap: int) -> list[tuple[int, int]]:
+    """Return every (i, j) with ``0 <= i < j < n_scans`` and ``j - i <= max_gap``.
+
+    Scan j is the reading, scan i the reference.  Ordered by j, then i: one pass over a recording
+    that remembers its last ``max_gap`` scans meets every pair.
+    Source: Sec. V-A.
+    """
+    return [(i, j) for j in range(1, n_scans) for i in range(max(0, j - max_gap), j)]
 
 
 def sample_recording(
@@ -83,82 +126,32 @@ def sample_recording(
             continue
         window[j] = prepare_scan(scan, recording.name, j, pipeline, sampling)
         for i in by_reading.get(j, []):
-            yield sample_prepared(
-                recording.name, i, j, window[i], window[j], pipeline, sampling, n_threads, progress
-            )
+            pair = pair_of(recording.name, i, j, window[i], window[j])
+            yield sample_pair(pair, pipeline, sampling, n_threads, progress)
     check_complete(recording.name, n_read, needed)
 
 
-def sample_prepared(
-    recording: str,
-    i: int,
-    j: int,
-    reference: Prepared,
-    reading: Prepared,
-    pipeline: Pipeline,
-    sampling: SamplingConfig,
-    n_threads: int = 1,
-    progress: Progress = lambda n: None,
-) -> PairRecord:
-    """Sample one pair of prepared scans; a scan without a cloud makes a rejected pair."""
-    T_mean = _between(reference, reading)
-    P, Q = reading.cloud, reference.cloud
-    if isinstance(P, CloudError) or isinstance(Q, CloudError):
-        return _without_cloud(recording, i, j, T_mean)
-    echoes = both_echoes(reference, reading)
-    return sample_pair(
-        recording, i, j, P, Q, T_mean, pipeline, sampling, n_threads, progress, echoes
-    )
-
-
-def describe_prepared(
-    recording: str,
-    i: int,
-    j: int,
-    reference: Prepared,
-    reading: Prepared,
-    pipeline: Pipeline,
-    sampling: SamplingConfig,
-) -> PairRecord:
-    """Describe one pair of prepared scans as ``describe_pair`` does."""
-    T_mean = _between(reference, reading)
-    P, Q = reading.cloud, reference.cloud
-    if isinstance(P, CloudError) or isinstance(Q, CloudError):
-        return _without_cloud(recording, i, j, T_mean)
-    return describe_pair(recording, i, j, P, Q, T_mean, pipeline, sampling)
-
-
 def sample_pair(
-    recording: str,
-    i: int,
-    j: int,
-    reading: Cloud,
-    reference: Cloud,
-    T_mean: Array,
+    pair: Pair,
     pipeline: Pipeline,
     sampling: SamplingConfig,
     n_threads: int = 1,
     progress: Progress = lambda n: None,
-    echoes: tuple[Echoes, Echoes] | None = None,
 ) -> PairRecord:
     """Register one pair many times and take the covariance about ground truth.
 
-    T_mean: (4, 4), true T_ref_read.  Each start is ``T_mean exp(xi)``, xi ~ N(0, variance I), and
+    Each start is ``T_mean exp(xi)``, xi ~ N(0, variance I), and
     each registration draws its own subsamples; with ``noise_m`` also noise, or where there are
-    echoes (reference, reading), two new scans.  There are ``n_samples`` of them, or fewer where
+    echoes, two new scans.  There are ``n_samples`` of them, or fewer where
     ``precision`` is reached before: the record is then that of the smaller ``n_samples``.
     Source: Sec. IV-D, V-A.
     """
-    record = describe_pair(recording, i, j, reading, reference, T_mean, pipeline, sampling)
+    record = describe_pair(pair, pipeline, sampling)
     if record.reason != PENDING:
         return record
     blocks: list[Block] = []
     for start, stop in pairwise([0, *stops(sampling)]):
-        blocks.append(
-            register_block(
-                record, reading, reference, pipeline, sampling, start, stop, n_threads, echoes
-            )
-        )
+        blocks.append(register_block(pair, pipeline, sampling, start, stop, n_threads))
         progress(stop - start)
         if sampling.precision > 0.0 and stop < sampling.n_samples:
             finished = finish_pair(record, blocks, sampling)
@@ -177,79 +170,94 @@ def stops(sampling: SamplingConfig) -> list[int]:
     return found
 
 
-def describe_pair(
-    recording: str,
-    i: int,
-    j: int,
-    reading: Cloud,
-    reference: Cloud,
-    T_mean: Array,
-    pipeline: Pipeline,
-    sampling: SamplingConfig,
-) -> PairRecord:
+def describe_pair(pair: Pair, pipeline: Pipeline, sampling: SamplingConfig) -> PairRecord:
     """Return a record with everything but samples, its reason PENDING; or a rejected one.
 
     The pair is described where ICP ends when it starts from the truth, as it will be online.
     """
-    base = PairRecord(recording=recording, i=i, j=j, accepted=False, T_mean=T_mean, reason=PENDING)
-    rng = np.random.default_rng(_pair_seed(base, sampling))
-    at_truth = register(reading, reference, T_mean, pipeline.icp, rng)
+    base = PairRecord(
+        recording=pair.recording,
+        i=pair.i,
+        j=pair.j,
+        accepted=False,
+        T_mean=pair.T_mean,
+        reason=PENDING,
+    )
+    rng = np.random.default_rng(_pair_seed(pair, sampling))
     try:
-        pair = describe(reading, reference, at_truth.T_ref_read, pipeline, sampling.n_rotations)
+        reading, reference = pair.clouds()
+        at_truth = register(reading, reference, pair.T_mean, pipeline.icp, rng)
+        described = describe(
+            reading, reference, at_truth.T_ref_read, pipeline, sampling.n_rotations
+        )
+    except CloudError:
+        return replace(base, reason="too_few_points")
     except NoOverlapError:
         return replace(base, reason="no_overlap")
     except RegistrationError:
         return replace(base, reason="singular")
     return replace(
         base,
-        overlap_ratio=pair.overlap_ratio,
-        descriptors=pair.descriptors.astype(np.float32),
-        features=pair.features,
+        overlap_ratio=described.overlap_ratio,
+        descriptors=described.descriptors.astype(np.float32),
+        features=described.features,
         rotations_rad=2.0 * np.pi * np.arange(sampling.n_rotations) / sampling.n_rotations,
-        shapes=pair.shapes,
+        shapes=described.shapes,
     )
 
 
 def register_block(
-    record: PairRecord,
-    reading: Cloud,
-    reference: Cloud,
+    pair: Pair,
     pipeline: Pipeline,
     sampling: SamplingConfig,
     start: int,
     stop: int,
     n_threads: int = 1,
-    echoes: tuple[Echoes, Echoes] | None = None,
 ) -> Block:
-    """Do the registrations ``start`` to ``stop - 1`` of a described pair.
+    """Do the registrations ``start`` to ``stop - 1`` of a pair that has been described.
 
     A registration without an answer, or with one that is not finite, is counted and left out.
     """
-    seed, T_mean = _pair_seed(record, sampling), record.T_mean
+    seed = _pair_seed(pair, sampling)
     starts = np.random.default_rng([*seed, 0]).normal(
         scale=np.sqrt(sampling.variance), size=(stop, 6)
     )[start:]
-    T_inits = T_mean @ exp(starts)
     seeds = [[*seed, 1, k] for k in range(start, stop)]
-    if sampling.noise_m > 0.0 and echoes is not None:
-        results = register_many_rescanned(
-            *echoes, T_inits, seeds, pipeline, sampling.noise_m, n_threads
-        )
-    elif sampling.noise_m > 0.0:
-        results = register_many_noisy(
-            reading, reference, T_inits, seeds, pipeline.icp, sampling.noise_m, n_threads
-        )
-    else:
-        results = register_many(reading, reference, T_inits, seeds, pipeline.icp, n_threads)
+    results = _registrations(
+        pair, pipeline, sampling.noise_m, pair.T_mean @ exp(starts), seeds, n_threads
+    )
     answers = [
         result for result in results if result.has_answer and np.isfinite(result.T_ref_read).all()
     ]
     T_found = np.array([result.T_ref_read for result in answers]).reshape(-1, 4, 4)
     return Block(
-        log(inverse(T_mean) @ T_found),
+        log(inverse(pair.T_mean) @ T_found),
         sum(result.converged for result in answers),
         stop - start - len(answers),
     )
+
+
+def _registrations(
+    pair: Pair,
+    pipeline: Pipeline,
+    noise_m: float,
+    T_inits: Array,
+    seeds: list[list[int]],
+    n_threads: int,
+) -> list[Registration]:
+    """Register from many starts, each with a seed of its own, and with noise if that is wanted."""
+    reading, reference = pair.clouds()
+    if noise_m <= 0.0:
+        return register_many(reading, reference, T_inits, seeds, pipeline.icp, n_threads)
+    echoes = pair.echoes()
+
+    def one(k: int) -> Registration:
+        rng = np.random.default_rng(seeds[k])
+        if echoes is not None:
+            return register_rescanned(*echoes, T_inits[k], pipeline, noise_m, rng)
+        return register_noisy(reading, reference, T_inits[k], pipeline.icp, noise_m, rng)
+
+    return in_threads(one, range(len(T_inits)), n_threads)
 
 
 def finish_pair(
@@ -270,6 +278,22 @@ def finish_pair(
 def is_precise(record: PairRecord, precision: float) -> bool:
     """Return whether each eigenvalue of the covariance has at most this relative error."""
     return record.accepted and bool((eigenvalue_errors(record.xi[record.kept]) <= precision).all())
+
+
+def eigenvalue_errors(xi: Array) -> Array:
+    """Return the relative standard errors (6,) of the eigenvalues of Y, in increasing order.
+
+    xi: (n, 6) errors about ground truth, whose covariance about zero is Y.  Along an eigenvector
+    v of Y, the eigenvalue is the mean of ``(v^T xi)^2``, so to first order its standard error is
+    that of a mean: ``std((v^T xi)^2) / sqrt(n)``.  For Gaussian errors the ratio to the
+    eigenvalue is ``sqrt(2 / n)``; heavy tails need more samples, an offset from the truth that
+    outweighs the scatter needs fewer.
+    Source: Anderson, Asymptotic Theory for Principal Component Analysis, 1963, with the fourth
+    moments taken from the samples.
+    """
+    values, vectors = np.linalg.eigh(sampled_covariance(xi))
+    squares = (xi @ vectors) ** 2
+    return np.asarray(squares.std(axis=0, ddof=1) / np.sqrt(len(xi)) / values)
 
 
 def _judged(record: PairRecord, sampling: SamplingConfig) -> PairRecord:
@@ -312,13 +336,6 @@ def prepare_scan(
     return Prepared(cloud, T_world_sensor, scan.echoes if sampling.noise_m > 0.0 else None)
 
 
-def both_echoes(reference: Prepared, reading: Prepared) -> tuple[Echoes, Echoes] | None:
-    """Return the echoes of both scans, or None where one cannot be scanned again."""
-    if reference.echoes is None or reading.echoes is None:
-        return None
-    return reference.echoes, reading.echoes
-
-
 def check_complete(name: str, n_read: int, needed: set[int]) -> None:
     """Raise RecordingError when a recording ended after n_read scans and more are needed."""
     if needed and n_read <= max(needed):
@@ -327,18 +344,8 @@ def check_complete(name: str, n_read: int, needed: set[int]) -> None:
         )
 
 
-def _between(reference: Prepared, reading: Prepared) -> Array:
-    return np.ascontiguousarray(inverse(reference.T_world_sensor) @ reading.T_world_sensor)
-
-
-def _without_cloud(recording: str, i: int, j: int, T_mean: Array) -> PairRecord:
-    return PairRecord(
-        recording=recording, i=i, j=j, accepted=False, T_mean=T_mean, reason="too_few_points"
-    )
-
-
-def _pair_seed(record: PairRecord, sampling: SamplingConfig) -> list[int]:
-    return [sampling.seed, _name_seed(record.recording), record.i, record.j]
+def _pair_seed(pair: Pair, sampling: SamplingConfig) -> list[int]:
+    return [sampling.seed, _name_seed(pair.recording), pair.i, pair.j]
 
 
 def _name_seed(name: str) -> int:

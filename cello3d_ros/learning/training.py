@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -69,7 +70,7 @@ class Training:
     curve: tuple[tuple[int, float, float], ...]
 
 
-def train(
+def fit(
     examples: Examples,
     config: TrainingConfig,
     validation: Examples | None = None,
@@ -78,8 +79,7 @@ def train(
     """Fit Theta by L-BFGS or SGD and return the model with the best one met.
 
     Best is by the loss on the validation recordings, predicted from the examples, or without them
-    by the regularised leave-recording-out loss; training ends when that has not improved for 20
-    iterations.
+    by the regularised leave-recording-out loss; 20 iterations without a better one end training.
     Theta = 0, the mean of the examples, takes part.  Deterministic; an interrupt (Ctrl-C) ends
     training with the best so far.  Raises DatasetError for fewer than two recordings.
     """
@@ -100,20 +100,27 @@ def train(
     figures = {"leave_recording_out": evaluate(problem, theta, examples, examples, config)}
     if validation is not None:
         figures["validation"] = evaluate(judge, theta, examples, validation, config)
-    provenance = {
-        "recordings": examples.n_pairs,
-        "validation_recordings": {} if validation is None else validation.n_pairs,
-        "rejected_pairs": examples.rejected,
-        "training": dataclasses.asdict(config),
-        "iterations": search.n_iterations,
-        "best_iteration": search.best_iteration,
-        "figures": {
-            name: {predictor: dataclasses.asdict(f) for predictor, f in by.items()}
-            for name, by in figures.items()
-        },
-        "versions": package_versions(),
-    }
-    model = Model(
+    model = _model(theta, (mean, scale), problem, examples, config)
+    model.provenance.update(_provenance(search, figures, validation))
+    return Training(
+        model=model,
+        figures=figures,
+        n_iterations=search.n_iterations,
+        best_iteration=search.best_iteration,
+        interrupted=search.interrupted,
+        curve=tuple(search.curve),
+    )
+
+
+def _model(
+    theta: Array,
+    scaler: tuple[Array, Array],
+    problem: Problem,
+    examples: Examples,
+    config: TrainingConfig,
+) -> Model:
+    mean, scale = scaler
+    return Model(
         theta=theta,
         mean=mean,
         scale=scale,
@@ -130,16 +137,27 @@ def train(
         lost=None if config.shape == "none" else known_lost(examples),
         pipeline=examples.pipeline,
         sampling=examples.sampling,
-        provenance=provenance,
+        provenance={
+            "recordings": examples.n_pairs,
+            "rejected_pairs": examples.rejected,
+            "training": dataclasses.asdict(config),
+            "versions": package_versions(),
+        },
     )
-    return Training(
-        model=model,
-        figures=figures,
-        n_iterations=search.n_iterations,
-        best_iteration=search.best_iteration,
-        interrupted=search.interrupted,
-        curve=tuple(search.curve),
-    )
+
+
+def _provenance(
+    search: _Search, figures: dict[str, dict[str, Figures]], validation: Examples | None
+) -> dict[str, Any]:
+    return {
+        "validation_recordings": {} if validation is None else validation.n_pairs,
+        "iterations": search.n_iterations,
+        "best_iteration": search.best_iteration,
+        "figures": {
+            name: {predictor: dataclasses.asdict(f) for predictor, f in by.items()}
+            for name, by in figures.items()
+        },
+    }
 
 
 def _input_range(examples: Examples, config: TrainingConfig) -> Array:

@@ -10,8 +10,7 @@ from pathlib import Path
 from cello3d_ros.config import Pipeline, SamplingConfig
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.learning.dataset import Dataset, open_dataset
-from cello3d_ros.learning.pairs import pairs
-from cello3d_ros.learning.sampling import sample_recording
+from cello3d_ros.learning.sampling import pairs, sample_recording
 from cello3d_ros.recordings import Recording, open_recording
 from cello3d_ros.recordings.challenging import is_challenging, sequence_of
 from cello3d_ros.reproduction.costs import Costs

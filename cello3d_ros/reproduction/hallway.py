@@ -84,6 +84,11 @@ def _figure(
     )
     for handle in legend.legend_handles[:2]:
         handle.set_markersize(6)
+    _draw_counts(counts, starts, xi, kept)
+    return figure
+
+
+def _draw_counts(counts: Any, starts: Array, xi: Array, kept: NDArray[np.bool_]) -> None:
     bins = np.arange(-3.025, 3.05, 0.05)
     counts.hist(starts[:, 0], bins, color="#cccccc", label="starts")
     counts.hist(xi[~kept, 0], bins, color=drawing.ORANGE, label=f"dropped ({(~kept).sum()})")
@@ -92,4 +97,3 @@ def _figure(
     counts.set_xticks(range(-3, 4))
     counts.grid(alpha=0.3)
     counts.legend(fontsize=8)
-    return figure

@@ -13,7 +13,7 @@ from cello3d_ros.covariance.model import Model, load_model, save_model
 from cello3d_ros.errors import ModelError
 from cello3d_ros.learning.dataset import Dataset, package_versions
 from cello3d_ros.learning.examples import Examples, load_examples
-from cello3d_ros.learning.training import train
+from cello3d_ros.learning.training import fit
 from cello3d_ros.reproduction.datasets import Recordings, Workshop, sampled
 from cello3d_ros.reproduction.sequences import SEQUENCES
 
@@ -79,7 +79,7 @@ def _trained(workshop: Workshop, name: str, examples: Examples, config: Training
         }
         if made_of != wanted:
             print(f"training {name} on {', '.join(examples.n_pairs)}", file=sys.stderr)
-            model = train(examples, config).model
+            model = fit(examples, config).model
             path.parent.mkdir(exist_ok=True)
             save_model(model, path)
     return model

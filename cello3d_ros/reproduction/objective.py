@@ -29,14 +29,7 @@ def make(n_samples: int, n_threads: int, seed: int) -> Result:
     xi = _sampled(n_samples, pipeline, n_threads, seed)
     Y = sampled_covariance(xi)
     C = censi_of(reading, reference, np.eye(4), pipeline, SIGMA_M)
-    grids = []
-    for half in _HALF_WIDTHS_M:
-        steps = np.linspace(-half, half, _N_GRID)
-        shifts = np.stack(
-            [*np.meshgrid(steps, steps, indexing="xy"), np.zeros((_N_GRID,) * 2)], -1
-        )
-        J = [objective(reading.points + t, reference, pipeline.icp) for t in shifts.reshape(-1, 3)]
-        grids.append(np.reshape(J, (_N_GRID, _N_GRID)))
+    grids = [_grid(reading, reference, pipeline.icp, half) for half in _HALF_WIDTHS_M]
     data = {
         "sigma_m": SIGMA_M,
         "n_points": _N_POINTS,
@@ -60,6 +53,14 @@ def make(n_samples: int, n_threads: int, seed: int) -> Result:
     rows = [["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"], *np.round(xi, 7).tolist()]
     title = "Objective of point-to-plane ICP on a cube"
     return Result("fig-objective", title, text, data, rows, _figure(grids, xi, Y, C))
+
+
+def _grid(reading: Cloud, reference: Cloud, config: IcpConfig, half_width_m: float) -> Array:
+    """Return the objective over translations in x and y."""
+    steps = np.linspace(-half_width_m, half_width_m, _N_GRID)
+    shifts = np.stack([*np.meshgrid(steps, steps, indexing="xy"), np.zeros((_N_GRID,) * 2)], -1)
+    J = [objective(reading.points + t, reference, config) for t in shifts.reshape(-1, 3)]
+    return np.reshape(J, (_N_GRID, _N_GRID))
 
 
 def objective(moved: Array, reference: Cloud, config: IcpConfig) -> float:

@@ -53,13 +53,7 @@ def make(workshop: Workshop, recordings: Recordings, source: str) -> Result:
     data = {
         "source": source,
         "n_samples": workshop.n_samples,
-        "sequences": {
-            key: {
-                "trained_on": list(SEQUENCES[key].trained_on),
-                "methods": {name: dataclasses.asdict(f) for name, f in row.items()},
-            }
-            for key, row in rows.items()
-        },
+        "sequences": {key: _data(key, row) for key, row in rows.items()},
     }
     text = (
         f"Mean KL divergence of the predicted from the sampled covariance, {source}, "
@@ -74,15 +68,30 @@ def make(workshop: Workshop, recordings: Recordings, source: str) -> Result:
         f"Ratios to the baseline's mean KL, those of medians in brackets. The paper's are on its "
         f"own data, which are not these.\n\n{markdown_table(_ratios(rows))}"
     )
-    csv: list[list[Any]] = [["sequence", "trained_on", "method", *_KEPT]]
-    csv += [
+    return Result(
+        "table1",
+        "Table I: single-pair covariance prediction",
+        text,
+        data,
+        _csv(rows),
+        _figure(rows),
+    )
+
+
+def _data(key: str, row: Row) -> dict[str, Any]:
+    return {
+        "trained_on": list(SEQUENCES[key].trained_on),
+        "methods": {name: dataclasses.asdict(found) for name, found in row.items()},
+    }
+
+
+def _csv(rows: dict[str, Row]) -> list[list[Any]]:
+    head: list[Any] = ["sequence", "trained_on", "method", *_KEPT]
+    return [head] + [
         [SEQUENCES[key].title, trained_on(key), name, *(getattr(row[name], k) for k in _KEPT)]
         for key, row in rows.items()
         for name in _METHODS
     ]
-    return Result(
-        "table1", "Table I: single-pair covariance prediction", text, data, csv, _figure(rows)
-    )
 
 
 def _row(workshop: Workshop, found: dict[str, Dataset], recordings: Recordings, key: str) -> Row:

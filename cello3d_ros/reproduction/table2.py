@@ -19,6 +19,10 @@ from cello3d_ros.reproduction.sequences import SEQUENCES
 
 Row = dict[str, Trajectory]  # by model
 
+_MEASURES = (
+    *("length_m", "n_runs", "n_failed", "n_lost", "error_m", "dm_translation"),
+    *("error_rad", "dm_rotation", "dm_6dof", "dm_6dof_median", "coverage_95"),
+)
 IDEAL_6DOF, IDEAL_3DOF = 2.35, 1.60  # means of chi with 6 and 3 degrees of freedom
 
 
@@ -59,18 +63,17 @@ def make(
         f"Relative model:\n\n{markdown_table(_table(rows, 'relative'))}\n\n"
         f"Paper's model:\n\n{markdown_table(_table(rows, 'paper'))}"
     )
-    measures = (
-        *("length_m", "n_runs", "n_failed", "n_lost", "error_m", "dm_translation"),
-        *("error_rad", "dm_rotation", "dm_6dof", "dm_6dof_median", "coverage_95"),
-    )
-    csv: list[list[Any]] = [["sequence", "model", *measures]]
-    csv += [
-        [SEQUENCES[key].title, name, *(getattr(report, k) for k in measures)]
+    title = "Table II: consistency over trajectories"
+    return Result("table2", title, text, data, _csv(rows), _figure(rows))
+
+
+def _csv(rows: dict[str, Row]) -> list[list[Any]]:
+    head: list[Any] = ["sequence", "model", *_MEASURES]
+    return [head] + [
+        [SEQUENCES[key].title, name, *(getattr(report, measure) for measure in _MEASURES)]
         for key, row in rows.items()
         for name, report in row.items()
     ]
-    title = "Table II: consistency over trajectories"
-    return Result("table2", title, text, data, csv, _figure(rows))
 
 
 def _sequence(workshop: Workshop, recordings: Any, model: Any, n_runs: int) -> Trajectory:

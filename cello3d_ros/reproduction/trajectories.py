@@ -46,33 +46,22 @@ def make(workshop: Workshop, training: Recordings, walks: Recordings) -> Result:
     needed = {k: training[k] for key in keys for k in SEQUENCES[key].trained_on}
     found = datasets(workshop, needed)
     shown = {key: _walk(workshop, found, walks, key) for key in keys}
-    data: dict[str, Any] = {"n_sigma": _N_SIGMA, "sequences": {}}
+    inside = {
+        key: {name: _share_inside(walk, path[-1]) for name, path in walk.paths.items()}
+        for key, walk in shown.items()
+    }
+    data = {
+        "n_sigma": _N_SIGMA,
+        "sequences": {key: _data(walk, inside[key]) for key, walk in shown.items()},
+    }
     rows: list[list[Any]] = [["sequence", "run", "scan", "x_m", "y_m", "z_m"]]
-    sentences = []
-    for key, walk in shown.items():
-        inside = {name: _share_inside(walk, path[-1]) for name, path in walk.paths.items()}
-        data["sequences"][key] = {
-            "truth": np.round(walk.truth[:, :3, 3], 5).tolist(),
-            "covariances": {
-                name: [_positions(pose).tolist() for pose in path]
-                for name, path in walk.paths.items()
-            },
-            "share_of_finals_inside": inside,
-            "n_drawn": len(walk.runs),
-            "n_lost": walk.n_lost,
-            "n_runs": _N_RUNS,
-        }
-        rows += [
-            [key, run, k + 1, *np.round(pose.T[:3, 3], 5).tolist()]
-            for run, path in enumerate(walk.runs)
-            for k, pose in enumerate(path)
-        ]
-        told = ", ".join(f"{share:.0%} ({_MODELS[name]})" for name, share in inside.items())
-        sentences.append(
-            f"{SEQUENCES[key].title}: {told}; {walk.n_lost} of {_N_RUNS} runs had a registration "
-            f"in another minimum, which no covariance covers, and "
-            f"{'are not drawn' if walk.n_lost < _N_RUNS else 'are drawn nevertheless'}"
-        )
+    rows += [
+        [key, run, k + 1, *np.round(pose.T[:3, 3], 5).tolist()]
+        for key, walk in shown.items()
+        for run, path in enumerate(walk.runs)
+        for k, pose in enumerate(path)
+    ]
+    sentences = [_sentence(key, walk, inside[key]) for key, walk in shown.items()]
     text = (
         f"Runs of ICP odometry from above, {_N_DRAWN} at most, with ellipses of {_N_SIGMA:g}σ of "
         f"the compounded covariance at each scan. Black is the truth, green the end. Errors and "
@@ -81,6 +70,28 @@ def make(workshop: Workshop, training: Recordings, walks: Recordings) -> Result:
     )
     title = "Trajectories: sampled against predicted covariances"
     return Result("fig-trajectories", title, text, data, rows, _figure(shown))
+
+
+def _data(walk: _Walk, inside: dict[str, float]) -> dict[str, Any]:
+    return {
+        "truth": np.round(walk.truth[:, :3, 3], 5).tolist(),
+        "covariances": {
+            name: [_positions(pose).tolist() for pose in path] for name, path in walk.paths.items()
+        },
+        "share_of_finals_inside": inside,
+        "n_drawn": len(walk.runs),
+        "n_lost": walk.n_lost,
+        "n_runs": _N_RUNS,
+    }
+
+
+def _sentence(key: str, walk: _Walk, inside: dict[str, float]) -> str:
+    told = ", ".join(f"{share:.0%} ({_MODELS[name]})" for name, share in inside.items())
+    return (
+        f"{SEQUENCES[key].title}: {told}; {walk.n_lost} of {_N_RUNS} runs had a registration "
+        f"in another minimum, which no covariance covers, and "
+        f"{'are not drawn' if walk.n_lost < _N_RUNS else 'are drawn nevertheless'}"
+    )
 
 
 def _walk(workshop: Workshop, found: dict[str, Dataset], walks: Recordings, key: str) -> _Walk:

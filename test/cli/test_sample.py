@@ -343,3 +343,25 @@ def test_the_bar_tells_registrations_a_second_and_the_time_left(tmp_path, record
     assert "reg/s" in last
     assert "pair 5 of 5" in last
     assert "<" in last
+
+
+def test_python_samples_trains_and_evaluates_as_the_verbs_do(tmp_path, recordings, capsys):
+    import cello3d_ros as cello
+    from cello3d_ros.config import load_config
+
+    recordings.append(write_kitti(tmp_path / "three", 2))
+    assert sample(tmp_path, recordings) == 0
+    config, reports = load_config(tmp_path / "config.yaml"), []
+    outcomes = cello.sample(recordings, tmp_path / "again", config, 2, reports.append)
+    assert outcomes == {"": 15}
+    assert reports[-1] == ("three", 750, 750, 15, 15)
+    assert files(tmp_path / "again") == files(tmp_path / "dataset")
+    model = tmp_path / "model.npz"
+    training = cello.train([tmp_path / "again"], model, config.training, exclude=["three"])
+    assert training.model.provenance["recordings"] == {"one": 5, "two": 5}
+    found = cello.evaluate([tmp_path / "again"], model, cello.EvaluationSettings(only=["three"]))
+    capsys.readouterr()
+    assert (
+        main(["evaluate", str(tmp_path / "again"), "--model", str(model), "--only", "three"]) == 0
+    )
+    assert f"covariances are {found.methods['cello3d'].verdict} " in capsys.readouterr().out

@@ -26,6 +26,7 @@ from cello3d_ros.errors import Cello3dError, DatasetError
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import PairRecord, open_dataset
 from cello3d_ros.learning.examples import load_examples
+from cello3d_ros.learning.train import split_recordings
 
 
 def fill(path: Path, names: list[str], seed: int = 0, **settings: object) -> Path:
@@ -89,7 +90,7 @@ def test_a_model_with_its_provenance_and_a_table_come_out(
     assert "validation (10 pairs)" in printed
     for row in ("cello3d", "mean covariance", "constant"):
         assert f"\n  {row} " in printed
-    figures = model.provenance["figures"]["validation"]["model"]
+    figures = model.provenance["figures"]["validation"]["cello3d"]
     assert f"{figures['kl_mean']:.4g}" in printed
 
 
@@ -299,14 +300,14 @@ def test_a_pattern_that_matches_nothing_is_refused(folder: Path, tmp_path: Path)
     ],
 )
 def test_split(validation: list[str], exclude: list[str], training: list[str]) -> None:
-    split = verb.split_recordings(["b_s0", "a_s1", "a_s0"], validation, exclude)
+    split = split_recordings(["b_s0", "a_s1", "a_s0"], validation, exclude)
     assert split.training == training
     assert not set(split.validation) & set(split.training)
 
 
 def test_nothing_left_to_train_on_is_said() -> None:
     with pytest.raises(DatasetError, match="no recording is left"):
-        verb.split_recordings(["a", "b"], ["*"], [])
+        split_recordings(["a", "b"], ["*"], [])
 
 
 def test_where_the_model_cannot_go_is_said_before_training(folder: Path, tmp_path: Path) -> None:

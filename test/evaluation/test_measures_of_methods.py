@@ -24,7 +24,7 @@ from cello3d_ros.geometry.gaussian import kl
 from cello3d_ros.learning.dataset import PairRecord, open_dataset
 from cello3d_ros.learning.examples import Examples, load_examples
 from cello3d_ros.learning.measures import Figures, best_scale, figures, pose_check, select
-from cello3d_ros.learning.training import train
+from cello3d_ros.learning.training import fit
 
 SIZES = np.array([0.01, 0.02, 0.03, 1e-3, 2e-3, 3e-3])
 
@@ -280,7 +280,7 @@ def test_the_baseline_is_the_mean_that_the_model_was_trained_on(tmp_path):
             )
         )
     np.testing.assert_allclose(mean_of([dataset]), 2.0 * np.eye(6))
-    model = train(load_examples([dataset], ["a", "b"]), TrainingConfig(max_iterations=1)).model
+    model = fit(load_examples([dataset], ["a", "b"]), TrainingConfig(max_iterations=1)).model
     assert seen_recordings(model, {"b": set(), "c": {"x"}}) == {"b": "b"}
     np.testing.assert_allclose(training_mean(model), 2.0 * np.eye(6))
     np.testing.assert_allclose(training_mean(constant_model(np.diag([7.0] * 6), 3)), 7 * np.eye(6))

@@ -26,8 +26,7 @@ from cello3d_ros.learning.cluster import (
 )
 from cello3d_ros.learning.cluster_tasks import _Reader
 from cello3d_ros.learning.dataset import open_dataset
-from cello3d_ros.learning.pairs import pairs
-from cello3d_ros.learning.sampling import sample_recording
+from cello3d_ros.learning.sampling import pairs, sample_recording
 from cello3d_ros.recordings import open_recording
 
 pytestmark = pytest.mark.skipif(
@@ -149,7 +148,11 @@ def test_blocks_workers_and_ways_of_reading_do_not_change_a_bit(
     todo, counts = pairs(5, 2), []
     with connected(cluster) as client:
         records = sample_recording_on(
-            client, open_recording(recording), todo, job(recording), block, ship, counts.append
+            client,
+            open_recording(recording),
+            todo,
+            job(recording, block=block, ship_clouds=ship),
+            counts.append,
         )
         assert_same(by_key(records, 7), local)
     assert sum(counts) == 7 * SAMPLING.n_samples
@@ -161,7 +164,7 @@ def test_workers_keep_blas_to_one_thread(recording, cluster):
 
     with connected(cluster) as client:
         records = sample_recording_on(
-            client, open_recording(recording), pairs(5, 2), job(recording), 20
+            client, open_recording(recording), pairs(5, 2), job(recording, block=20)
         )
         by_key(records, 7)
         used = list(client.run(blas_threads).values())
@@ -195,9 +198,13 @@ def test_simulated_worlds_are_scanned_anew_as_on_one_machine(tmp_path, cluster, 
 def test_only_what_is_asked_for_is_sampled(recording, cluster, local):
     todo = [(1, 3), (2, 3)]
     with connected(cluster) as client:
-        records = sample_recording_on(client, open_recording(recording), todo, job(recording), 30)
+        records = sample_recording_on(
+            client, open_recording(recording), todo, job(recording, block=30)
+        )
         assert_same(by_key(records, 2), {k: v for k, v in local.items() if k[1:] in todo})
-        nothing = sample_recording_on(client, open_recording(recording), [], job(recording), 30)
+        nothing = sample_recording_on(
+            client, open_recording(recording), [], job(recording, block=30)
+        )
         assert list(nothing) == []
 
 
@@ -212,8 +219,7 @@ def test_adaptive_sampling_is_that_of_one_machine(recording, cluster):
             client,
             open_recording(recording),
             todo,
-            job(recording, sampling),
-            10,
+            job(recording, sampling, block=10),
             progress=counts.append,
         )
         assert_same(by_key(found, 2), wanted)
@@ -241,9 +247,7 @@ def test_a_worker_killed_at_any_moment_loses_no_pair_and_doubles_none(recording,
                     client,
                     open_recording(recording),
                     pairs(5, 2),
-                    job(recording),
-                    15,
-                    ship_clouds=bool(moment % 2),
+                    job(recording, block=15, ship_clouds=bool(moment % 2)),
                     progress=kill_one,
                 )
                 assert_same(by_key(records, 7), local)
@@ -314,7 +318,10 @@ def test_workers_of_other_versions_are_refused(recording, cluster):
     versions = (("numpy", "0.9"),)
     with connected(cluster) as client:
         records = sample_recording_on(
-            client, open_recording(recording), [(0, 1)], job(recording, versions=versions), 30
+            client,
+            open_recording(recording),
+            [(0, 1)],
+            job(recording, versions=versions, block=30),
         )
         with pytest.raises(ClusterError, match=r"a worker has numpy .*, this machine 0.9"):
             list(records)
@@ -325,7 +332,10 @@ def test_a_recording_that_ends_early_keeps_the_pairs_before(recording, cluster, 
     found = []
     with connected(cluster) as client:
         records = sample_recording_on(
-            client, open_recording(recording), [(0, 1), (3, 4), (4, 5)], job(recording), 30, ship
+            client,
+            open_recording(recording),
+            [(0, 1), (3, 4), (4, 5)],
+            job(recording, block=30, ship_clouds=ship),
         )
         with pytest.raises(RecordingError, match="ends early, after 5 scans: scan 5 is missing"):
             found.extend(records)
@@ -338,7 +348,7 @@ def test_a_recording_that_ends_early_keeps_the_pairs_before(recording, cluster, 
 def test_a_recording_that_the_workers_cannot_see_is_one_sentence(recording, cluster):
     with connected(cluster) as client:
         records = sample_recording_on(
-            client, open_recording(recording), [(0, 1)], job("/nowhere/room"), 30
+            client, open_recording(recording), [(0, 1)], job("/nowhere/room", block=30)
         )
         with pytest.raises(RecordingError, match="/nowhere/room: no such file"):
             list(records)

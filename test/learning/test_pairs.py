@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cello3d_ros.learning.pairs import pairs
+from cello3d_ros.learning.sampling import pairs
 
 
 @pytest.mark.parametrize(("n_scans", "max_gap"), [(2, 1), (5, 4), (7, 2), (35, 4), (3, 10)])

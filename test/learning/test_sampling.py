@@ -10,9 +10,11 @@ from cello3d_ros.errors import CloudError, RecordingError
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import exp, inverse, log, transform
 from cello3d_ros.learning.noise import noisy
-from cello3d_ros.learning.precision import eigenvalue_errors
 from cello3d_ros.learning.sampling import (
+    Pair,
+    Prepared,
     describe_pair,
+    eigenvalue_errors,
     finish_pair,
     is_precise,
     register_block,
@@ -49,6 +51,12 @@ def cloud(points):
     return prepare(points, PIPELINE.cloud, np.random.default_rng(0))
 
 
+def a_pair(name, reading, reference, T_mean=None):
+    """A pair whose reference stands at the origin."""
+    T_mean = np.eye(4) if T_mean is None else T_mean
+    return Pair(name, 0, 1, Prepared(reading, T_mean), Prepared(reference, np.eye(4)), T_mean)
+
+
 def hallway(seed):
     """Four walls along x without ends, rough on a scale that does not tell where along x."""
     rng = np.random.default_rng(seed)
@@ -63,13 +71,9 @@ def hallway(seed):
 @pytest.mark.parametrize("turn", [0.0, 0.6])
 def test_a_hallway_is_free_along_itself(turn):
     R = exp([0, 0, 0, 0, 0, turn])
+    reading, reference = (cloud(transform(R, hallway(seed))) for seed in (1, 2))
     record = sample_pair(
-        "hallway",
-        0,
-        1,
-        cloud(transform(R, hallway(1))),
-        cloud(transform(R, hallway(2))),
-        np.eye(4),
+        a_pair("hallway", reading, reference),
         PIPELINE,
         SamplingConfig(n_samples=150, variance=0.02, cluster_scale_m=0.5),
         n_threads=2,
@@ -86,7 +90,7 @@ def test_the_covariance_is_on_the_reading_side_about_the_truth(room):
     b = np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])
     reading, reference = cloud(transform(inverse(T), room[0])), cloud(room[1])
     record = sample_pair(
-        "room", 0, 1, reading, reference, T @ exp(-b), PIPELINE, SAMPLING, n_threads=2
+        a_pair("room", reading, reference, T @ exp(-b)), PIPELINE, SAMPLING, n_threads=2
     )
     assert record.accepted
     np.testing.assert_allclose(record.xi[record.kept].mean(axis=0), b, atol=0.01)
@@ -158,12 +162,7 @@ def test_pairs_that_cannot_be_learned_from_say_why(room):
 def test_pairs_that_fail_consistently_are_rejected(room):
     wrong = exp([0, 0, 0, 0, 0, 1.4])  # the "truth" is turned, ICP finds another pose
     record = sample_pair(
-        "r",
-        0,
-        1,
-        cloud(room[0]),
-        cloud(room[1]),
-        wrong,
+        a_pair("r", cloud(room[0]), cloud(room[1]), wrong),
         PIPELINE,
         SamplingConfig(n_samples=50, variance=1e-4, max_offset_rad=0.3, max_offset_m=0.3),
     )
@@ -194,14 +193,12 @@ def with_samples(n, **settings):
 def test_blocks_of_any_size_make_the_same_record(room):
     reading, reference = cloud(room[0]), cloud(room[1])
     sampling = with_samples(50)
-    whole = sample_pair("r", 0, 1, reading, reference, np.eye(4), PIPELINE, sampling)
-    pair = describe_pair("r", 0, 1, reading, reference, np.eye(4), PIPELINE, sampling)
+    pair = a_pair("r", reading, reference)
+    whole = sample_pair(pair, PIPELINE, sampling)
+    record = describe_pair(pair, PIPELINE, sampling)
     for cuts in ([0, 7, 8, 50], [0, 49, 50]):
-        blocks = [
-            register_block(pair, reading, reference, PIPELINE, sampling, a, b)
-            for a, b in pairwise(cuts)
-        ]
-        assert_same(finish_pair(pair, blocks, sampling), whole)
+        blocks = [register_block(pair, PIPELINE, sampling, a, b) for a, b in pairwise(cuts)]
+        assert_same(finish_pair(record, blocks, sampling), whole)
 
 
 def test_adaptive_sampling_stops_early_and_is_the_shorter_run(room):
@@ -209,9 +206,7 @@ def test_adaptive_sampling_stops_early_and_is_the_shorter_run(room):
 
     def run(sampling):
         counts = []
-        record = sample_pair(
-            "r", 0, 1, reading, reference, np.eye(4), PIPELINE, sampling, 2, counts.append
-        )
+        record = sample_pair(a_pair("r", reading, reference), PIPELINE, sampling, 2, counts.append)
         assert sum(counts) == record.n_samples
         return record
 
@@ -226,7 +221,7 @@ def test_adaptive_sampling_stops_early_and_is_the_shorter_run(room):
 
 def test_a_rejected_pair_is_never_precise(room):
     wrong = sample_pair(
-        "r", 0, 1, cloud(room[0]), cloud(room[1]), exp([0, 0, 0, 0, 0, 1.4]), PIPELINE,
+        a_pair("r", cloud(room[0]), cloud(room[1]), exp([0, 0, 0, 0, 0, 1.4])), PIPELINE,
         with_samples(60, precision=1.0, min_samples=50, max_offset_m=0.1, max_offset_rad=0.1),
     )  # fmt: skip
     assert not wrong.accepted
@@ -282,8 +277,7 @@ def test_noise_widens_the_covariance_and_none_changes_nothing(room):
     for sigma in (0.0, 1e-9, 0.05):
         sampling = with_samples(60, noise_m=sigma)
         one, two = (
-            sample_pair("r", 0, 1, reading, reference, np.eye(4), PIPELINE, sampling, n)
-            for n in (1, 2)
+            sample_pair(a_pair("r", reading, reference), PIPELINE, sampling, n) for n in (1, 2)
         )
         assert one.accepted
         assert_same(one, two)
@@ -394,8 +388,9 @@ def test_registrations_without_an_answer_are_counted_and_left_out(room, monkeypa
     """Of four, one fails, one gives a pose that is not finite, one stops at its last step."""
     reading, reference = cloud(room[0]), cloud(room[1])
     sampling = with_samples(50)
-    pair = describe_pair("r", 0, 1, reading, reference, np.eye(4), PIPELINE, sampling)
-    answer = register_block(pair, reading, reference, PIPELINE, sampling, 0, 1)
+    pair = a_pair("r", reading, reference)
+    record = describe_pair(pair, PIPELINE, sampling)
+    answer = register_block(pair, PIPELINE, sampling, 0, 1)
 
     def some(reading, reference, starts, seeds, config, n_threads):
         from cello3d_ros.registration.icp import Registration
@@ -409,10 +404,10 @@ def test_registrations_without_an_answer_are_counted_and_left_out(room, monkeypa
         ]
 
     monkeypatch.setattr("cello3d_ros.learning.sampling.register_many", some)
-    block = register_block(pair, reading, reference, PIPELINE, sampling, 0, 4)
+    block = register_block(pair, PIPELINE, sampling, 0, 4)
     assert (len(block.xi), block.n_converged, block.n_failed) == (2, 1, 2)
     np.testing.assert_allclose(block.xi, [answer.xi[0], np.zeros(6)], atol=1e-12)
-    assert finish_pair(pair, [block], sampling).reason == "singular"
+    assert finish_pair(record, [block], sampling).reason == "singular"
 
 
 def test_clouds_with_fewer_points_than_neighbors_are_no_clouds():

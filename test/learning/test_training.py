@@ -23,7 +23,7 @@ from cello3d_ros.learning.loss import (
     median_rho,
     predicted,
 )
-from cello3d_ros.learning.training import known_lost, train
+from cello3d_ros.learning.training import fit, known_lost
 
 PAPER = TrainingConfig(
     features="descriptor", shape="none", theta="diagonal", mean_weight=0.0, regularization=1e-3
@@ -175,7 +175,7 @@ def test_an_example_never_sees_its_own_recording(mean_weight: float) -> None:
 
 def test_planted_feature_is_found_and_beats_the_mean() -> None:
     config = dataclasses.replace(PAPER, theta="upper_triangular")
-    training = train(planted(seed=0), config, planted(100, seed=1))
+    training = fit(planted(seed=0), config, planted(100, seed=1))
     figures = training.figures["validation"]
     assert figures["cello3d"].kl_mean < 0.3 * figures["mean_covariance"].kl_mean
     weights = np.linalg.norm(training.model.theta / training.model.scale, axis=0)
@@ -191,7 +191,7 @@ def test_targets_are_the_pairs_as_they_were_recorded() -> None:
     np.testing.assert_array_equal(problem.Y, examples.covariances)
     np.testing.assert_array_equal(problem.X_examples, examples.features.reshape(-1, 5))
     with pytest.raises(DatasetError, match="none at 0 rad"):
-        train(some(rotations=(0.5, 1.0)), config)
+        fit(some(rotations=(0.5, 1.0)), config)
 
 
 @pytest.mark.parametrize("form", ["upper_triangular", "diagonal", "low_rank"])
@@ -200,7 +200,7 @@ def test_the_search_ends_where_the_regularised_gradient_vanishes(form: str) -> N
     config = dataclasses.replace(
         PAPER, theta=form, rank=2, regularization=0.02, max_iterations=500
     )
-    model = train(examples, config).model
+    model = fit(examples, config).model
     problem = leave_out_problem(examples, config, model.mean, model.scale)
     _, gradient = loss_and_gradient(model.theta, problem)
     residual = gradient + 2 * 0.02 * model.theta
@@ -217,7 +217,7 @@ def test_the_search_ends_where_the_regularised_gradient_vanishes(form: str) -> N
 def test_the_search_starts_where_many_examples_are_heard(form: str) -> None:
     examples = some(150, n_features=60)
     losses: list[float] = []
-    train(
+    fit(
         examples,
         dataclasses.replace(PAPER, theta=form, max_iterations=1),
         progress=lambda iteration, training, judged: losses.append(training),
@@ -232,7 +232,7 @@ def test_the_search_starts_where_many_examples_are_heard(form: str) -> None:
 @pytest.mark.parametrize("form", ["upper_triangular", "diagonal", "low_rank"])
 def test_pure_noise_is_within_two_percent_of_the_mean(form: str) -> None:
     config = dataclasses.replace(PAPER, theta=form, rank=4, regularization=0.03)
-    training = train(noise(400, 2), config, noise(200, 3))
+    training = fit(noise(400, 2), config, noise(200, 3))
     unseen = noise(300, 4)
     F = np.array([predict(training.model, d[0]).covariance for d in unseen.features])
     baseline = np.tile(noise(400, 2).covariances.mean(axis=0), (300, 1, 1))
@@ -247,7 +247,7 @@ def test_the_model_predicts_as_training_judged_it(form: str, shape: str) -> None
     config = TrainingConfig(
         features="descriptor", shape=shape, theta=form, rank=2, max_iterations=5, mean_weight=0.1
     )
-    training = train(examples, config, validation)
+    training = fit(examples, config, validation)
     F = np.array(
         [
             predict(training.model, d[0], None if shape == "none" else S).covariance
@@ -272,7 +272,7 @@ def test_a_turned_copy_predicts_the_turned_covariance() -> None:
         mean_weight=0.0,
         max_iterations=1,
     )
-    model = train(examples, config).model
+    model = fit(examples, config).model
     Ad = adjoint(exp([0, 0, 0, 0, 0, 0.7]))
     for k in range(6):
         turned_S = Ad @ examples.shapes["sandwich"][k] @ Ad.T
@@ -292,7 +292,7 @@ def test_constant_features_weigh_nothing() -> None:
     config = TrainingConfig(
         features="descriptor", shape="none", theta="low_rank", rank=3, max_iterations=3
     )
-    model = train(dataclasses.replace(examples, features=features), config).model
+    model = fit(dataclasses.replace(examples, features=features), config).model
     assert model.scale[2] == 1.0
     assert not model.theta[:, 2].any()
 
@@ -301,7 +301,7 @@ def test_training_twice_gives_the_same_bits() -> None:
     config = TrainingConfig(
         features="descriptor", shape="none", theta="low_rank", rank=2, max_iterations=15
     )
-    one, two = train(some(), config).model, train(some(), config).model
+    one, two = fit(some(), config).model, fit(some(), config).model
     for name in ("theta", "mean", "scale", "projections", "covariances"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
     assert one.provenance == two.provenance
@@ -318,7 +318,7 @@ def test_the_order_of_the_examples_does_not_change_predictions() -> None:
         xi=tuple(examples.xi[k] for k in order),
     )
     config = dataclasses.replace(PAPER, max_iterations=3)  # rounding grows from step to step
-    one, two = train(examples, config).model, train(shuffled, config).model
+    one, two = fit(examples, config).model, fit(shuffled, config).model
     d = np.linspace(-1, 1, 5)
     np.testing.assert_allclose(predict(one, d).covariance, predict(two, d).covariance, rtol=1e-6)
 
@@ -341,32 +341,32 @@ def test_stochastic_descent_is_that_of_one_target_after_another_at_a_small_rate(
     theta = np.ones(10) / np.sqrt(median_rho(problem, np.ones(10)))
     _, gradient = loss_and_gradient(theta, problem)
     expected = theta - rate * len(problem.X) * (gradient + 2 * SGD.regularization * theta)
-    found = np.abs(np.diagonal(train(examples, config, judge).model.theta))
+    found = np.abs(np.diagonal(fit(examples, config, judge).model.theta))
     np.testing.assert_allclose(found - theta, expected - theta, rtol=1e-3)
 
 
 @pytest.mark.parametrize("form", ["diagonal", "low_rank", "upper_triangular"])
 def test_stochastic_descent_lowers_the_loss_on_planted_data(form: str) -> None:
     config = dataclasses.replace(SGD, theta=form, learning_rate=1e-4, max_iterations=10)
-    training = train(planted(), config, planted(150, 1))
+    training = fit(planted(), config, planted(150, 1))
     losses = np.array([loss for _, loss, _ in training.curve])
     assert (np.diff(losses) < 0).all()
     assert losses[-1] < losses[0] - 0.02
-    paper = train(planted(), dataclasses.replace(config, learning_rate=1e-5))
+    paper = fit(planted(), dataclasses.replace(config, learning_rate=1e-5))
     assert paper.curve[-1][1] < paper.curve[0][1]
-    again = train(planted(), config, planted(150, 1))
+    again = fit(planted(), config, planted(150, 1))
     assert again.curve == training.curve
     np.testing.assert_array_equal(again.model.theta, training.model.theta)
 
 
 def test_too_high_a_rate_is_one_sentence() -> None:
     with pytest.raises(ConfigError, match=r"training.learning_rate must be less than 1e\+100"):
-        train(planted(60), dataclasses.replace(SGD, learning_rate=1e100))
+        fit(planted(60), dataclasses.replace(SGD, learning_rate=1e100))
 
 
 def test_the_curve_is_what_progress_was_told() -> None:
     told: list[tuple[int, float, float]] = []
-    training = train(planted(60), PAPER, planted(60, 1), lambda *step: told.append(step))
+    training = fit(planted(60), PAPER, planted(60, 1), lambda *step: told.append(step))
     assert list(training.curve) == told
     assert [step for step, _, _ in told] == list(range(training.n_iterations + 1))
     examples, config = planted(60), PAPER
@@ -382,8 +382,8 @@ def test_an_interrupt_keeps_the_best_so_far() -> None:
         if iteration == 2:
             raise KeyboardInterrupt
 
-    training = train(planted(120), PAPER, planted(60, 1), interrupt)
-    whole = train(planted(120), PAPER, planted(60, 1))
+    training = fit(planted(120), PAPER, planted(60, 1), interrupt)
+    whole = fit(planted(120), PAPER, planted(60, 1))
     assert training.interrupted
     assert not whole.interrupted
     assert training.n_iterations == 2 < whole.n_iterations
@@ -398,7 +398,7 @@ def test_the_best_theta_by_validation_is_kept() -> None:
         seen.append((validation, iteration))
 
     config = dataclasses.replace(PAPER, theta="upper_triangular", regularization=0.0)
-    training = train(noise(60, 5), config, noise(60, 6), record)
+    training = fit(noise(60, 5), config, noise(60, 6), record)
     best = min(seen)
     assert training.n_iterations == seen[-1][1] <= training.best_iteration + 20
     assert training.best_iteration in (best[1], 0)
@@ -414,7 +414,7 @@ def test_figures_say_both_how_far_and_in_which_direction() -> None:
         covariances=np.tile(Y, (60, 1, 1)),
         xi=tuple(rng.multivariate_normal(np.zeros(6), 4 * Y, size=50) for _ in range(60)),
     )
-    figures = train(examples, PAPER).figures["leave_recording_out"]
+    figures = fit(examples, PAPER).figures["leave_recording_out"]
     assert set(figures) == {"cello3d", "mean_covariance", "constant"}
     # all pairs have the same covariance, and the sampled errors are twice as large
     assert figures["cello3d"].kl_mean == pytest.approx(0.0, abs=1e-9)
@@ -423,7 +423,7 @@ def test_figures_say_both_how_far_and_in_which_direction() -> None:
     assert figures["cello3d"].coverage_95 == pytest.approx(inside, abs=0.03)
     smaller = dataclasses.replace(examples, covariances=np.tile(Y, (60, 1, 1)))
     smaller.covariances[examples.groups == "world_s0"] /= 10
-    figures = train(smaller, PAPER).figures["leave_recording_out"]
+    figures = fit(smaller, PAPER).figures["leave_recording_out"]
     assert figures["mean_covariance"].dm2_over_6 == pytest.approx((0.1 + 2 / 0.55) / 3)
     wide, narrow = (float(kl(np.eye(6), size * np.eye(6))) for size in (0.55, 10.0))
     assert figures["mean_covariance"].kl_mean == pytest.approx((2 * wide + narrow) / 3)
@@ -437,24 +437,24 @@ def test_figures_say_both_how_far_and_in_which_direction() -> None:
 def test_one_recording_is_too_few() -> None:
     examples = dataclasses.replace(some(), groups=np.array(["alone"] * 24))
     with pytest.raises(DatasetError, match=r"at least two recordings.*found only alone"):
-        train(examples, PAPER)
+        fit(examples, PAPER)
 
 
 def test_a_recording_cannot_be_validated_on_and_trained_on() -> None:
     with pytest.raises(DatasetError, match="world_s0 is both trained on and validated on"):
-        train(some(), PAPER, some(3))
+        fit(some(), PAPER, some(3))
 
 
 def test_a_singular_shape_is_one_sentence() -> None:
     examples = some()
     examples.shapes["sandwich"][5] = np.diag([1.0, 1, 1, 1, 1, 0])
     with pytest.raises(DatasetError, match="the sandwich of a pair is singular to rounding"):
-        train(examples, TrainingConfig(features="descriptor", shape="sandwich"))
+        fit(examples, TrainingConfig(features="descriptor", shape="sandwich"))
 
 
 def test_a_missing_shape_is_named() -> None:
     with pytest.raises(DatasetError, match="does not hold the sandwich"):
-        train(
+        fit(
             dataclasses.replace(some(), shapes={}),
             TrainingConfig(features="descriptor", shape="sandwich"),
         )
@@ -545,8 +545,8 @@ def test_the_papers_form_knows_nothing_of_other_minima() -> None:
     lost_xi = np.random.default_rng(4).normal(size=(400, 6))
     examples = dataclasses.replace(some(), lost_xi=lost_xi)
     relative = dataclasses.replace(PAPER, shape="sandwich", max_iterations=2)
-    assert train(examples, dataclasses.replace(PAPER, max_iterations=2)).model.lost is None
-    assert train(examples, relative).model.lost is not None
+    assert fit(examples, dataclasses.replace(PAPER, max_iterations=2)).model.lost is None
+    assert fit(examples, relative).model.lost is not None
 
 
 def test_datasets_of_different_settings_do_not_mix(tmp_path: Path) -> None:
@@ -589,12 +589,12 @@ def test_global_features_are_learned_from_without_turned_copies() -> None:
         rotations_rad=np.array([0.0, 1.0]),
     )
     config = dataclasses.replace(PAPER, features="global", max_iterations=20)
-    model = train(with_both, config).model
-    plain = train(examples, dataclasses.replace(config, features="descriptor")).model
+    model = fit(with_both, config).model
+    plain = fit(examples, dataclasses.replace(config, features="descriptor")).model
     assert model.features == "global"
     assert model.n_examples == 120
     np.testing.assert_allclose(model.theta, plain.theta, rtol=1e-4, atol=1e-6)
-    both = train(with_both, dataclasses.replace(config, features="both")).model
+    both = fit(with_both, dataclasses.replace(config, features="both")).model
     assert both.n_features == plain.n_features + 4
     seen = with_both.global_features
     np.testing.assert_array_equal(model.input_range, [seen.min(axis=0), seen.max(axis=0)])
@@ -602,11 +602,11 @@ def test_global_features_are_learned_from_without_turned_copies() -> None:
     assert plain.rotations_rad.tolist() == examples.rotations_rad.tolist()
     np.testing.assert_allclose(plain.training_mean, examples.covariances.mean(axis=0), rtol=1e-12)
     with pytest.raises(DatasetError, match="no global features"):
-        train(examples, config)
+        fit(examples, config)
 
 
 def test_the_evidence_is_that_of_leaving_recordings_out() -> None:
-    model = train(planted(120), dataclasses.replace(PAPER, max_iterations=5)).model
+    model = fit(planted(120), dataclasses.replace(PAPER, max_iterations=5)).model
     groups = planted(120).groups
     P = model.projections
     rho = ((P[:, None] - P) ** 2).sum(axis=2)
@@ -617,7 +617,7 @@ def test_the_evidence_is_that_of_leaving_recordings_out() -> None:
 
 def test_the_margin_is_in_the_figures_too() -> None:
     one, wide = (
-        train(planted(60), dataclasses.replace(PAPER, margin=margin, max_iterations=3))
+        fit(planted(60), dataclasses.replace(PAPER, margin=margin, max_iterations=3))
         for margin in (1.0, 2.0)
     )
     a, b = (t.figures["leave_recording_out"]["cello3d"] for t in (one, wide))

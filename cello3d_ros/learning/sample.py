@@ -1,0 +1,128 @@
+"""Sample ICP on every pair of recordings into a dataset, which survives any interruption."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from threadpoolctl import threadpool_limits
+
+from cello3d_ros.config import Config, pipeline_of
+from cello3d_ros.errors import ConfigError
+from cello3d_ros.learning.dataset import Dataset, PairRecord, open_dataset
+from cello3d_ros.learning.identity import fingerprint, scan_prints
+from cello3d_ros.learning.sampling import Progress, pairs, sample_recording
+from cello3d_ros.recordings import Recording, open_recording
+from cello3d_ros.simulation.rescan import rescannable
+from cello3d_ros.simulation.simulation import Simulation
+
+
+class Status(NamedTuple):
+    """How far sampling is.  what: a few words; n_registrations: that are done, of n_total."""
+
+    what: str
+    n_registrations: int = 0
+    n_total: int = 0
+    n_pairs: int = 0
+    n_pairs_total: int = 0
+
+
+#: Samples some pairs of a recording opened at a path, reporting registrations.
+Sampler = Callable[[Recording, str, list[tuple[int, int]], Progress], Iterator[PairRecord]]
+
+
+def sample(
+    recordings: Sequence[Path | str],
+    out: Path | str,
+    config: Config | None = None,
+    n_threads: int = 1,
+    report: Callable[[Status], None] = lambda status: None,
+    sampler: Sampler | None = None,
+) -> Counter[str]:
+    """Sample what is missing of recordings into the dataset ``out``; the same call resumes.
+
+    config: its pipeline and its section ``sampling`` apply.  sampler: what samples the pairs of a
+    recording in place of the threads of this machine.  Returns how many pairs have which outcome:
+    "" is accepted, all others are reasons.
+    Raises ConfigError, DatasetError, RecordingError; pairs that were done before stand.
+    """
+    config = config or Config()
+    sampling, pipeline = config.sampling, pipeline_of(config)
+    opened = _opened(recordings, sampling.noise_m > 0.0)
+    dataset = open_dataset(out, pipeline, sampling, create=True)
+    for recording in opened.values():
+        report(Status(f"reading {recording.name}"))
+        _add(dataset, recording)
+
+    def here(
+        recording: Recording, path: str, todo: list[tuple[int, int]], progress: Progress
+    ) -> Iterator[PairRecord]:
+        return sample_recording(recording, todo, pipeline, sampling, n_threads, progress)
+
+    try:
+        with threadpool_limits(1, user_api="blas"):  # its threads take the kernels' cores
+            return _sample(opened, dataset, sampler or here, n_threads, report)
+    except SystemError as error:  # what CPython makes of Ctrl-C in a compiled kernel
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            raise error.__cause__ from None
+        raise
+
+
+def _opened(paths: Sequence[Path | str], rescan: bool) -> dict[str, Recording]:
+    """Return recordings by path.  Raises ConfigError for two of one name."""
+    opened = {str(path): (rescannable if rescan else open_recording)(Path(path)) for path in paths}
+    names = Counter(recording.name for recording in opened.values())
+    if len(opened) < len(paths) or max(names.values(), default=0) > 1:
+        name = names.most_common(1)[0][0]
+        raise ConfigError(f"two recordings are named {name!r}: their pairs would mix")
+    return opened
+
+
+def _add(dataset: Dataset, recording: Recording) -> None:
+    """Write down what tells this recording from others of its name."""
+    facts: dict[str, Any] = {"n_scans": len(recording), "fingerprint": fingerprint(recording)}
+    known = dataset.recordings.get(recording.name, {})
+    if scans := known.get("scans") or scan_prints(recording):
+        facts["scans"] = scans
+    if dataset.sampling.noise_m > 0.0:
+        facts["noise"] = "rescans" if isinstance(recording, Simulation) else "added"
+    dataset.add_recording(recording.name, facts)
+
+
+def _sample(
+    opened: dict[str, Recording],
+    dataset: Dataset,
+    sampler: Sampler,
+    n_threads: int,
+    report: Callable[[Status], None],
+) -> Counter[str]:
+    """Sample what is missing of all recordings; return how often each outcome occurs."""
+    n_samples, outcomes, todo = dataset.sampling.n_samples, Counter[str](), {}
+    report(Status("checking what is done"))
+    for path, recording in opened.items():
+        wanted = pairs(len(recording), dataset.sampling.max_gap)
+        done = dataset.outcomes(recording.name, wanted, n_threads)
+        outcomes.update(done.values())
+        todo[path] = [ij for ij in wanted if ij not in done]
+    n_missing = sum(map(len, todo.values()))
+    n_pairs, n_total, n_done, name = outcomes.total() + n_missing, n_samples * n_missing, 0, ""
+
+    def tell() -> None:
+        report(Status(name, n_done, n_total, outcomes.total(), n_pairs))
+
+    def progress(n: int) -> None:
+        nonlocal n_done
+        n_done += n
+        tell()
+
+    for path, recording in opened.items():
+        name = recording.name
+        tell()
+        for record in sampler(recording, path, todo[path], progress):
+            dataset.write(record)
+            outcomes[record.reason] += 1
+            n_total -= n_samples - record.n_samples  # rejected, or ended early
+            tell()
+    return outcomes

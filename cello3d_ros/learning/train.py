@@ -1,0 +1,122 @@
+"""Learn a model from datasets on disk, with recordings kept apart by their use."""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+import glob
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from cello3d_ros.atomic import new_file
+from cello3d_ros.config import TrainingConfig
+from cello3d_ros.covariance.model import save_model
+from cello3d_ros.errors import DatasetError, WriteError
+from cello3d_ros.learning.dataset import open_dataset
+from cello3d_ros.learning.examples import load_examples
+from cello3d_ros.learning.identity import check_apart, recordings_of
+from cello3d_ros.learning.training import Progress, Training, fit
+
+
+class Split(NamedTuple):
+    """Names of recordings by their use; what is excluded is in neither."""
+
+    training: list[str]
+    validation: list[str]
+
+
+def train(
+    datasets: Sequence[Path | str],
+    out: Path | str,
+    config: TrainingConfig | None = None,
+    validation: Sequence[Path | str] = (),
+    exclude: Sequence[Path | str] = (),
+    progress: Progress | None = None,
+) -> Training:
+    """Learn a model from datasets and write it to ``out``, and beside it its learning curve.
+
+    validation: recordings (names or patterns) or dataset folders that say when to stop, never
+    trained on; exclude: those that are not looked at.
+    Raises DatasetError for what cannot be trained on or kept apart, WriteError before training
+    where ``out`` cannot be written.
+    """
+    out = Path(out)
+    if out.is_dir() or not out.parent.is_dir():
+        raise WriteError(f"cannot write the model {out}: not a file in an existing folder")
+    folders = [*datasets, *filter(_is_dataset, validation)]
+    opened = [open_dataset(path) for path in {Path(f).resolve(): f for f in folders}.values()]
+    known = recordings_of(opened)
+    split = split_recordings(known, _patterns(validation), _patterns(exclude))
+    excluded = sorted(set(known) - set(split.training) - set(split.validation))
+    check_apart(known, split.training, split.validation, excluded)
+    examples = load_examples(opened, split.training)
+    judging = load_examples(opened, split.validation) if split.validation else None
+    training = fit(examples, config or TrainingConfig(), judging, progress)
+    prints = {name: sorted(known[name]) for name in (*split.training, *split.validation)}
+    provenance = {**training.model.provenance, "prints": prints}
+    model = dataclasses.replace(training.model, provenance=provenance)
+    save_model(model, out)
+    judged_by = "validation recordings" if judging else "training, regularised"
+    _plot(training, judged_by, curve_beside(out))
+    return dataclasses.replace(training, model=model)
+
+
+def curve_beside(model: Path) -> Path:
+    """Return where the learning curve of a model is drawn."""
+    return model.with_suffix(".learning_curve.png")
+
+
+def split_recordings(
+    names: Iterable[str], validation: Sequence[str], exclude: Sequence[str]
+) -> Split:
+    """Divide recordings by patterns; to exclude wins over to validate, both over training.
+
+    Raises DatasetError for a pattern that matches nothing: a misspelt one would train on tests.
+    """
+    names = sorted(set(names))
+    for pattern in (*validation, *exclude):
+        if not any(fnmatch.fnmatchcase(name, pattern) for name in names):
+            raise DatasetError(f"no recording matches {pattern!r}: there are {', '.join(names)}")
+    excluded = {name for name in names if _matches(name, exclude)}
+    validating = [name for name in names if _matches(name, validation) and name not in excluded]
+    training = [name for name in names if name not in excluded and name not in validating]
+    if not training:
+        raise DatasetError("no recording is left to train on")
+    return Split(training, validating)
+
+
+def _matches(name: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _is_dataset(word: Path | str) -> bool:
+    return (Path(word) / "manifest.json").is_file()
+
+
+def _patterns(words: Sequence[Path | str]) -> list[str]:
+    """Return patterns of recordings: those given, and every name in the folders given."""
+    patterns: list[str] = []
+    for word in words:
+        if _is_dataset(word):
+            patterns += map(glob.escape, open_dataset(word).recordings)
+        else:
+            patterns.append(str(word))
+    return patterns
+
+
+def _plot(training: Training, judged_by: str, path: Path) -> None:
+    """Write a PNG of the losses over the iterations.  judged_by: name of what judged Theta."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    iterations, losses, judged = zip(*training.curve)
+    axes.plot(iterations, losses, label="training recordings, each from the others")
+    axes.plot(iterations, judged, label=judged_by)
+    axes.axvline(training.best_iteration, color="grey", linestyle=":", label="kept")
+    axes.set(xlabel="iteration", ylabel="loss")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    with new_file(path) as partial:
+        figure.savefig(partial, format="png", metadata={"Software": None})
