@@ -20,7 +20,7 @@ from cello3d_ros.geometry.gaussian import to_fixed_axes
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log, transform
 from cello3d_ros.recordings.bag_writer import write_bag
 from cello3d_ros.recordings.recording import Scan
-from cello3d_ros.tracking.tracker import Tracker
+from cello3d_ros.tracking.tracker import estimator_of
 
 T_TRUE = exp([0.3, -0.2, 0.05, 0.01, 0.02, 0.15])
 T_INIT = T_TRUE @ exp([0.05, 0.02, 0.0, 0.0, 0.0, 0.02])
@@ -127,9 +127,9 @@ def test_points_that_are_not_finite_are_left_out(scans: tuple[Array, Array]) -> 
 
 def test_the_defaults_are_those_of_the_node() -> None:
     node = NodeConfig()
-    tracker = Tracker(cello.load_model(), Config(), node)
-    assert tracker._estimator().settings == DEFAULTS
-    assert (tracker._estimator().method, node.seed) == ("cello3d", 0)
+    estimator = estimator_of(cello.load_model(), Config(), node)
+    assert estimator.settings == DEFAULTS
+    assert (estimator.method, node.seed) == ("cello3d", 0)
 
 
 class InMemory(list[Scan]):
