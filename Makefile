@@ -39,8 +39,9 @@ clean:
 $(VENV)/.ready: setup.py
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; v < (3, 11) and sys.exit( \
 	  "cello3d_ros needs Python 3.11 or newer; $(PYTHON) is Python %d.%d: make PYTHON=python3.12" % v)'
-	@echo "Setting up $(VENV): about a minute, 1.8 GB."
-	set -e; \
+	@echo "Setting up $(VENV): about a minute, 2 GB."
+	@set -e; \
+	(while sleep 5; do echo "  still setting up"; done) & trap "kill $$!" EXIT; \
 	if $(PYTHON) -c "import rclpy" 2>/dev/null; then \
 	  $(PYTHON) -m venv --system-site-packages $(VENV); extras="open3d,dev"; \
 	else \

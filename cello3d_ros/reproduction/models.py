@@ -22,7 +22,7 @@ _PAPER = TrainingConfig(
 )
 
 #: By name: the paper's model, with the loss whose minimiser is right; the same as it is best
-#: regularised (docs/models.md: a diagonal Theta, and a share of the training mean in each
+#: regularised (docs/evaluation.md: a diagonal Theta, and a share of the training mean in each
 #: prediction, which bounds what one wrong neighbour costs); and what this package adds.
 #: A Theta of low rank predicts much as an upper triangular one does (Apartment: median KL 4.03 and
 #: 4.14, mean 629 and 600), for a fifth of the training.

@@ -62,7 +62,7 @@ def make(workshop: Workshop, recordings: Recordings, source: str) -> Result:
         f"with the log-det loss, but for a Theta of low rank and a quasi-Newton search. "
         f"*Regularised*: the same with a diagonal Theta, lambda "
         f"{MODELS['paper'].regularization:g} and {MODELS['paper'].mean_weight:.0%} of the "
-        f"training mean in each prediction, as docs/models.md found best. *Relative*: "
+        f"training mean in each prediction, as docs/evaluation.md found best. *Relative*: "
         f"covariances are averaged relative to each pair's sandwich. Censi assumes "
         f"{100 * SIGMA_M:g} cm of noise.\n\n{markdown_table(_table(rows))}\n\n"
         f"Ratios to the baseline's mean KL, those of medians in brackets. The paper's are on its "

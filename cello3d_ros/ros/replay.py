@@ -31,7 +31,7 @@ _TYPES: dict[str, Any] = {
     "markers": MarkerArray,
     "diagnostics": DiagnosticArray,
 }
-_START_S = 180.0  # left to a node to start: the first time it compiles its kernels
+_START_S = 600.0  # left to a live node to start: a busy machine compiles for minutes
 _MATCHING_S = 1.0  # in which the node, too, learns of the publisher of clouds
 _N_ODOMETRY = 4  # odometry messages for each cloud
 

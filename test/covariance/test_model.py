@@ -669,7 +669,7 @@ def test_a_shipped_model_is_small_and_says_what_it_was_made_of(name: str) -> Non
     assert model.pipeline == Pipeline()
     assert is_positive_definite(model.training_mean)
     assert model.input_range.shape == (2, len(FEATURES))
-    tested = {"11", "12", "13", "14"}  # seeds of which docs/models.md has the figures
+    tested = {"11", "12", "13", "14"}  # seeds of which docs/evaluation.md has the figures
     seen = {**model.provenance["recordings"], **model.provenance["validation_recordings"]}
     assert seen
     assert not tested & {recording.rsplit("_s", 1)[1] for recording in seen}
