@@ -69,7 +69,8 @@ def run(arguments: argparse.Namespace) -> None:
         out = arguments.out if arguments.seeds is None else arguments.out / simulation.name
         progress = with_progress(simulation, len(simulation), simulation.name)
         provenance = {"made_by": _command(arguments, seed), KEY: told(simulation)}
-        write_bag(out, progress, provenance=provenance)
+        odometry = None if drive is None else simulation.track()
+        write_bag(out, progress, odometry=odometry, provenance=provenance)
         print(f"{out}: {len(simulation)} scans of {simulation.name}")
 
 

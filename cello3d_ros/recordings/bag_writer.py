@@ -22,6 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 from cello3d_ros.atomic import new_folder
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings.bag_messages import Messages
 from cello3d_ros.recordings.mcap_checksums import add_checksums
@@ -47,6 +48,7 @@ def write_bag(
     scans: Iterable[Scan],
     *,
     odometry_per_scan: int = 10,
+    odometry: PoseTrack | None = None,
     provenance: Mapping[str, str] | None = None,
     storage: str = "mcap",
     double: bool = False,
@@ -56,7 +58,8 @@ def write_bag(
     ``/points`` is PointCloud2 (float32 x, y, z, ...; frame ``lidar``); ``/odom`` and
     ``/ground_truth`` are Odometry of ``lidar`` in ``odom`` and ``map``, left out where a scan has
     none.  Their covariances are 0: unknown.  ``/odom`` has a message at each cloud's stamp, just
-    before the cloud, and interpolated ones between: ``odometry_per_scan`` an interval in all.
+    before the cloud, and interpolated ones between: ``odometry_per_scan`` an interval in all, or
+    those of the track ``odometry``, which may begin before the first scan.
     ``/tf`` has map -> odom -> base_link (without odometry map -> base_link), ``/tf_static``
     base_link -> lidar, the identity.
 
@@ -67,7 +70,7 @@ def write_bag(
     """
     path = Path(path)
     counts = {POINTS: 0}
-    messages = _messages(scans, odometry_per_scan, double)
+    messages = _messages(scans, odometry_per_scan if odometry is None else odometry, double)
     with new_folder(path) as folder:
         write_messages(folder, _counted(messages, counts), provenance or {}, storage)
         if not counts[POINTS]:
@@ -142,7 +145,7 @@ def _qos(topic: str) -> Qos:
 
 
 def _messages(
-    scans: Iterable[Scan], odometry_per_scan: int, double: bool
+    scans: Iterable[Scan], between: int | PoseTrack, double: bool
 ) -> Iterator[tuple[str, int, Any]]:
     """Yield topic, stamp and message in order of time."""
     make = Messages(get_typestore(Stores.ROS2_JAZZY))
@@ -150,12 +153,13 @@ def _messages(
     for scan in scans:
         now = scan.stamp_ns
         if before is None:
-            yield TF_STATIC, now, make.transform(np.eye(4), now, "base_link", "lidar")
+            first = now if isinstance(between, int) else min(now, int(between.stamps_ns[0]))
+            yield TF_STATIC, first, make.transform(np.eye(4), first, "base_link", "lidar")
         elif now <= before.stamp_ns:
             raise RecordingError(
                 f"scans are not in order of time: {now} follows {before.stamp_ns}"
             )
-        for stamp_ns, T in _odometry(before, scan, odometry_per_scan):
+        for stamp_ns, T in _odometry(before, scan, between):
             yield ODOMETRY, stamp_ns, make.odometry(T, stamp_ns, "odom")
             yield TF, stamp_ns, make.transform(T, stamp_ns, "odom", "base_link")
         if (T_world := scan.T_world_sensor) is not None:
@@ -168,13 +172,20 @@ def _messages(
         before = scan
 
 
-def _odometry(before: Scan | None, scan: Scan, n: int) -> Iterator[tuple[int, Array]]:
+def _odometry(
+    before: Scan | None, scan: Scan, between: int | PoseTrack
+) -> Iterator[tuple[int, Array]]:
     """Yield odometry after the scan before, up to and at this one."""
     if scan.T_odom_sensor is None:
         return
-    if before is not None and before.T_odom_sensor is not None:
+    if not isinstance(between, int):
+        stamps = between.stamps_ns
+        after = 0 if before is None else np.searchsorted(stamps, before.stamp_ns, side="right")
+        for stamp_ns in stamps[after : np.searchsorted(stamps, scan.stamp_ns)].tolist():
+            yield stamp_ns, between.pose(stamp_ns)
+    elif before is not None and before.T_odom_sensor is not None:
         span = scan.stamp_ns - before.stamp_ns
-        for stamp_ns in sorted({before.stamp_ns + span * k // n for k in range(1, n)}):
+        for stamp_ns in sorted({before.stamp_ns + span * k // between for k in range(1, between)}):
             if before.stamp_ns < stamp_ns < scan.stamp_ns:
                 share = (stamp_ns - before.stamp_ns) / span
                 yield stamp_ns, se3.interpolate(before.T_odom_sensor, scan.T_odom_sensor, share)

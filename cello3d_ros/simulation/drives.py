@@ -32,6 +32,8 @@ class Drive:
     sweeps: whether each beam is sent from where the robot is at its own time, and points carry
     times; else a scan is taken at one instant.
     body: whether the scanner sees parts of the robot.
+    odometry_share, odometry_deg_per_m: how odometry drifts from scan to scan, as
+    ``drift_odometry`` says: share of the motion, of length and of angle, and degrees per metre.
     """
 
     motion: str = "forward"
@@ -45,6 +47,8 @@ class Drive:
     yaw_deg: float = 0.0
     sweeps: bool = True
     body: bool = False
+    odometry_share: float = 0.02
+    odometry_deg_per_m: float = 0.1
 
     def __post_init__(self) -> None:
         laws = {
@@ -57,6 +61,8 @@ class Drive:
             "roll_deg": abs(self.roll_deg) <= 180,
             "pitch_deg": abs(self.pitch_deg) <= 180,
             "yaw_deg": abs(self.yaw_deg) <= 360,
+            "odometry_share": 0 <= self.odometry_share <= 1,
+            "odometry_deg_per_m": 0 <= self.odometry_deg_per_m <= 100,
         }
         for name, holds in laws.items():
             if not holds:
@@ -143,10 +149,11 @@ def _waves(t: Array, rng: np.random.Generator) -> Array:
 
 def body(drive: Drive) -> Mesh:
     """Return what the scanner sees of its robot, in the sensor frame: a deck and two posts."""
-    length, width = (2.2, 1.5) if drive.height_m > 1.4 else (0.7, 0.5)
-    deck = box([0.0, 0.0, drive.height_m - 0.2], [length, width, 0.04])
+    length, width, below = (2.2, 1.5, 0.45) if drive.height_m > 1.4 else (0.7, 0.5, 0.15)
+    deck = box([0.0, 0.0, drive.height_m - below], [length, width, 0.04])
     posts = [
-        cylinder([-0.4 * length, y * width, drive.height_m - 0.2], 0.45, 0.02) for y in (-0.4, 0.4)
+        cylinder([-0.4 * length, y * width, drive.height_m - below], below + 0.3, 0.02)
+        for y in (-0.4, 0.4)
     ]
     mesh = painted(join([deck, *posts]), 0.2)
     T = se3.inverse(drive.T_base_sensor)

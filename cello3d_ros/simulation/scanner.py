@@ -141,19 +141,21 @@ class Scanner:
         return _spherical(np.radians(a.ravel()), np.radians(e.ravel()))
 
     def _ring_rosette(self, turn: int) -> Array:
-        """Lines that turn about the vertical, each at another phase of one swing up and down."""
+        """Lines that turn about the vertical and swing up and down.
+
+        They stand evenly around, and pass one azimuth evenly over the swing.
+        """
         rows, columns = self.shape
-        t = turn * self.sweep_s + self.times().reshape(rows, columns)
-        swing = (_SWING_HZ * t + np.arange(rows)[:, None] / rows) % 1.0
-        share = 1.0 - np.abs(2.0 * swing - 1.0)
+        line = np.arange(rows)[:, None] / rows
+        t = turn * self.sweep_s + self.times().reshape(rows, columns) + line / _TURN_HZ
+        share = 1.0 - np.abs(2.0 * ((_SWING_HZ * t + line) % 1.0) - 1.0)
         e = self.min_elevation_deg + share * (self.max_elevation_deg - self.min_elevation_deg)
-        a = 2 * np.pi * (_TURN_HZ * t + np.arange(rows)[:, None] / rows)
-        return _spherical(a.ravel(), np.radians(e.ravel()))
+        return _spherical((2 * np.pi * _TURN_HZ * t).ravel(), np.radians(e.ravel()))
 
 
 _PRISMS_HZ = (121.567, -77.733)  # 7294 and -4664 turns a minute
 _LINE_STEP_DEG = 0.7
-_SWING_HZ, _TURN_HZ = 171.31, 10.17
+_SWING_HZ, _TURN_HZ = 301.7, 10.17
 
 
 def _spherical(azimuth: Array, elevation: Array) -> Array:

@@ -112,7 +112,8 @@ class Simulation:
         times = times[times <= last]
         after_s = 1e-9 * (times - first)
         T_odom_world = built.odometry @ se3.inverse(built.truth)
-        drift = PoseTrack.of_poses(stamps, T_odom_world).motion(first, np.maximum(after_s, 0.0))
+        drifted = PoseTrack.of_poses(stamps, T_odom_world, np.inf)
+        drift = drifted.motion(first, np.maximum(after_s, 0.0))
         exact = built.truth[0] @ built.track.motion(first, after_s)
         return PoseTrack.of_poses(times, T_odom_world[0] @ drift @ exact)
 
@@ -150,7 +151,7 @@ class Simulation:
             else:
                 truth = walk(world.route, self.n_scans, way.uniform(0.9, 1.5), way)
             track = PoseTrack.of_poses(stamps, truth)
-        return _Built(world, track, truth, drift_odometry(truth, drift))
+        return _Built(world, track, truth, _drifting(truth, self.drive, drift))
 
 
 class _Built(NamedTuple):
@@ -167,6 +168,19 @@ def _driven(
     end_s = 1e-9 * (stamps[-1] - stamps[0])
     times, poses = trajectory(route, drive, start_s, end_s, rng)
     return PoseTrack.of_poses(stamps[0] + np.round(1e9 * times).astype(np.int64), poses)
+
+
+def _drifting(truth: Array, drive: Drive | None, rng: np.random.Generator) -> Array:
+    """Return the odometry (n, 4, 4) of a walk or of a drive."""
+    if drive is None:
+        return drift_odometry(truth, rng)
+    return drift_odometry(
+        truth,
+        rng,
+        translation_share=drive.odometry_share,
+        rotation_rad_per_m=float(np.radians(drive.odometry_deg_per_m)),
+        rotation_share=drive.odometry_share,
+    )
 
 
 def _at(track: PoseTrack, stamp_ns: int, after_s: Array) -> Array:

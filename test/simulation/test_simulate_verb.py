@@ -10,6 +10,7 @@ import pytest
 from cello3d_ros.cli import simulate as verb
 from cello3d_ros.errors import ConfigError, RecordingError, WriteError
 from cello3d_ros.recordings import open_recording
+from cello3d_ros.recordings.deskew import deskew
 from cello3d_ros.simulation.drives import Drive
 from cello3d_ros.simulation.products import SCANNERS
 from cello3d_ros.simulation.rescan import rescannable
@@ -71,6 +72,8 @@ def test_a_drive_is_told_and_its_points_carry_times(tmp_path: Path) -> None:
     for kept, scan in zip(recording, made, strict=True):
         assert np.array_equal(kept.points, scan.points)
         assert np.allclose(kept.time_s, scan.time_s, atol=1e-9)
+        undone, expected = deskew(kept, recording.track()), deskew(scan, made.track())
+        assert np.abs(undone.points - expected.points).max() < 1e-5  # the first sweep as well
     metadata = (tmp_path / "bag" / "metadata.yaml").read_text()
     assert "--drive reverse" in " ".join(metadata.split())  # the file folds long lines
     assert type(rescannable(tmp_path / "bag")) is type(recording)  # its motion is in the scans
