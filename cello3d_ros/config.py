@@ -234,11 +234,11 @@ class PairingConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class CovarianceConfig(Section):
-    """What says how far a registration is to be trusted."""
+    """How the covariance of a registration is found."""
 
     covariance_mode: str = _setting(
         "cello3d",
-        "what says how far a registration is to be trusted",
+        "how the covariance is found",
         choices=COVARIANCE_MODES,
     )
     sensor_sigma_m: float = _setting(
@@ -281,7 +281,9 @@ class NodeConfig(OutputConfig, CovarianceConfig, PairingConfig, InputConfig):
     """What only the node needs."""
 
     model: str = _setting("", "model file or name of a shipped one; empty is general")
-    autostart: bool = _setting(True, "configure and activate at once; false waits to be told")
+    autostart: bool = _setting(
+        True, "configure and activate at once; false waits for a life cycle manager"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

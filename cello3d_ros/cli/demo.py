@@ -268,7 +268,7 @@ def table(summary: dict[str, Any], name: str) -> Iterator[str]:
         yield f"  {what:24}{value:>14}   {note}".rstrip()
     ratio = summary["mean_d2_over_6"]
     if ratio is None and summary["relative_poses"]:
-        yield "Without ground truth nobody can say whether the covariance is right."
+        yield "The recording has no ground truth, so the covariance cannot be judged."
     elif ratio is not None:
         yield f"The covariance is {verdict(ratio)} (D2/6 {ratio:.2g}; 1 is right)."
 

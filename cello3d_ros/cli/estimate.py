@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=COVARIANCE_MODES,
         default="cello3d",
-        help="what says how far the registration is to be trusted",
+        help="how the covariance is found",
     )
     parser.add_argument("--seed", type=int, default=0, help="of the random subsamples")
     parser.add_argument("--json", action="store_true", help="print JSON")

@@ -71,8 +71,8 @@ def recordings_of(datasets: Sequence[Dataset]) -> dict[str, set[str]]:
         named = {n: str(f.get("fingerprint", "")) for n, f in dataset.recordings.items()}
         if strange := sorted({key[0] for key in dataset.pair_keys()} - set(named)):
             raise DatasetError(
-                f"{dataset.path} holds pairs of {strange[0]!r}, which its manifest does not name: "
-                "whence they are is not known"
+                f"{dataset.path} holds pairs of {strange[0]!r}, which its manifest does not name; "
+                "sample it again"
             )
         for name, found in named.items():
             if found and known.get(name) and found != known[name]:

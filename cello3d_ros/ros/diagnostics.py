@@ -41,10 +41,10 @@ def judged(C: Array, found: Estimate, config: NodeConfig) -> Verdict:
             reasons = [f"3 sigma are {longest_m:.3g} m, more than node.{name} {limit_m:g}"]
     if found.is_lost:
         level = max(level, WARN)
-        reasons.append("probably lost: the scans do not fit as they do where ICP is right")
+        reasons.append("probably lost: the scans fit badly, and the pose may be off by a metre")
     if found.is_unknown:
         level = max(level, WARN)
-        reasons.append("out of distribution: the pair is unlike all that the model has seen")
+        reasons.append("out of distribution: the model has seen no pair like this one")
     return Verdict(level, "; ".join(reasons) or "answered")
 
 
