@@ -7,13 +7,17 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cello3d_ros.cli.sources import add_source_arguments, open_source
 from cello3d_ros.errors import RecordingError
+
+if TYPE_CHECKING:
+    from cello3d_ros.config import Pipeline
+    from cello3d_ros.recordings.recording import Recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,6 +67,31 @@ def run(arguments: argparse.Namespace) -> None:
         _write_json(arguments.report, as_dict(found))
     shutil.rmtree(folder, ignore_errors=True)
     print("\n".join([", ".join(map(str, written)), *sentences(found)]))
+
+
+def joint(
+    paths: Sequence[Path | str], dataset: Path, config: Pipeline, n_threads: int
+) -> list[Recording]:
+    """Align recordings for a dataset, say how good the poses are and return the parts.
+
+    The poses are kept beside the dataset, in DATASET.joint, so that a second call finds them.
+    """
+    from threadpoolctl import threadpool_limits
+
+    from cello3d_ros.config import pipeline_of
+    from cello3d_ros.learning.align_report import sentences
+    from cello3d_ros.learning.aligned import aligned_parts
+    from cello3d_ros.recordings import open_recording
+
+    found: list[Recording] = []
+    for path in paths:
+        recording = open_recording(path)
+        folder = dataset.with_name(f"{dataset.name}.joint") / recording.name
+        with bar(recording.name) as progress, threadpool_limits(1, user_api="blas"):
+            parts = aligned_parts(recording, folder, pipeline_of(config), n_threads, progress)
+        print("\n".join(sentences(parts[0].alignment)))
+        found += parts
+    return found
 
 
 @contextmanager

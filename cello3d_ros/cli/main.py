@@ -19,6 +19,7 @@ VERBS = {
     "align": "find reference poses from the recording itself",
     "sample": "sample ICP on every pair of recordings into a dataset",
     "train": "learn a model from datasets",
+    "tune": "fit a model to one recording of your own",
     "evaluate": "judge covariances beside every baseline",
     "report": "turn an evaluation into one page to look at",
     "reproduce": "make the paper's tables and figures again",

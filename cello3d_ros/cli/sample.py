@@ -55,6 +55,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="threads"
     )
+    parser.add_argument(
+        "--poses",
+        choices=("recorded", "joint"),
+        default="recorded",
+        help="ground truth: as recorded, or joint poses found in the clouds (docs/align.md)",
+    )
     cluster = parser.add_argument_group("on a Dask cluster (docs/cluster.md)")
     cluster.add_argument("--scheduler", metavar="ADDRESS", help="such as tcp://host:8786")
     cluster.add_argument(
@@ -71,10 +77,15 @@ def run(arguments: argparse.Namespace) -> None:
 
     config = load_config(arguments.config) if arguments.config else Config()
     config = replace(config, sampling=_sampling(config, arguments))
-    with _progress() as report, _sampler(arguments, config) as sampler:
-        outcomes = sample(
-            arguments.recordings, arguments.out, config, arguments.jobs, report, sampler
-        )
+    recordings = arguments.recordings
+    if arguments.poses == "joint":
+        from cello3d_ros.cli.align import joint
+
+        if arguments.scheduler and not arguments.ship_clouds:
+            raise ConfigError("--poses joint needs --ship-clouds: workers have no joint poses")
+        recordings = joint(recordings, Path(arguments.out), config, arguments.jobs)
+    with progress_bar() as report, _sampler(arguments, config) as sampler:
+        outcomes = sample(recordings, arguments.out, config, arguments.jobs, report, sampler)
     print(f"{arguments.out}: {_summary(outcomes)}")
 
 
@@ -112,7 +123,7 @@ def _sampler(arguments: argparse.Namespace, config: Config) -> Iterator[Sampler 
 
 
 @contextmanager
-def _progress() -> Iterator[Callable[[Status], None]]:
+def progress_bar() -> Iterator[Callable[[Status], None]]:
     """Give a bar that counts registrations, with their rate and the time left."""
     from tqdm import tqdm
 

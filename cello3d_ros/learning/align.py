@@ -52,7 +52,7 @@ _OUTLIER = 8.0  # times the usual difference of half-sets: a scan that does not 
 _OUTLIER_M, _OUTLIER_RAD = 0.03, 0.015  # from these on
 _STATE = "state.npz"
 _VERSION = 1  # of the state
-_FACTS = ("sweep", "position", "is_last", "moves_m", "compensated")
+_FACTS = ("sweep", "position", "is_last", "is_done", "moves_m", "compensated")
 _ARRAYS = ("stamps_ns", "keyframes", "held", "moved", "halves", "first_poses")
 
 Progress = Callable[[int, int], None]  # scans visited so far, and in all as far as known
@@ -128,6 +128,7 @@ class _State:
     sweep: int = 1
     position: int = 0
     is_last: bool = False
+    is_done: bool = False
     moves_m: list[float] = field(default_factory=list)
     compensated: bool = False
 
@@ -146,7 +147,8 @@ def align(
 
     start: poses to start from; without them odometry, else the poses of the recording, else none.
     folder: where scans and the state are kept, so that the same call goes on after an interrupt;
-    without it a temporary one.  The result depends on the recording, start and seed alone.
+    without it a temporary one; of a finished alignment the poses stay there.  The result depends
+    on the recording, start and seed alone.
     Raises RecordingError when fewer than 3 scans hold to one another.
     """
     pipeline = pipeline or Pipeline()
@@ -263,7 +265,7 @@ def _sweep(
     members = np.flatnonzero(state.chain.part >= 0)
     n = len(state.chain.part)
     saved = time.monotonic()
-    while state.sweep <= MAX_SWEEPS:
+    while not state.is_done:
         order = members if state.sweep % 2 else members[::-1]
         done = set(order[: state.position].tolist())
         for k in order[state.position :].tolist():
@@ -276,11 +278,14 @@ def _sweep(
                 saved = time.monotonic()
         state.moves_m.append(_median_move(state.moved[members, :3], state.chain.part[members]))
         if state.is_last:
-            return
+            break
         rests = state.moves_m[-1] < _TOLERANCE_M and state.sweep >= _FEWEST_SWEEPS
         state.sweep, state.position = state.sweep + 1, 0
         state.is_last = rests or state.sweep == MAX_SWEEPS
         _save(folder, key, state)
+    state.is_done = True
+    _save(folder, key, state)
+    store.clear()
 
 
 def _median_move(moved: Array, part: NDArray[np.int64]) -> float:

@@ -82,6 +82,13 @@ class ScanStore:
         points, normals = (rows.astype(np.float64) for rows in scan)
         return ShapedScan(points, normals)
 
+    def clear(self) -> None:
+        """Remove all scans."""
+        self._cache.clear()
+        for pattern in ("*.raw.npz", "[0-9]*.[0-9]*.npz"):
+            for path in self.folder.glob(pattern):
+                path.unlink()
+
     def _remember(self, key: tuple[int, int], scan: _Single) -> None:
         self._cache[key] = scan
         self._cache.move_to_end(key)

@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from cello3d_ros.config import Config, pipeline_of
 from cello3d_ros.errors import ConfigError
+from cello3d_ros.learning.aligned import AlignedPart, pose_facts
 from cello3d_ros.learning.dataset import Dataset, PairRecord, open_dataset
 from cello3d_ros.learning.identity import fingerprint, scan_prints
 from cello3d_ros.learning.sampling import Progress, pairs, sample_recording
@@ -34,7 +35,7 @@ Sampler = Callable[[Recording, str, list[tuple[int, int]], Progress], Iterator[P
 
 
 def sample(
-    recordings: Sequence[Path | str],
+    recordings: Sequence[Path | str | Recording],
     out: Path | str,
     config: Config | None = None,
     n_threads: int = 1,
@@ -43,6 +44,7 @@ def sample(
 ) -> Counter[str]:
     """Sample what is missing of recordings into the dataset ``out``; the same call resumes.
 
+    recordings: paths, or what is open already, such as the parts of an alignment.
     config: its pipeline and its section ``sampling`` apply.  sampler: what samples the pairs of a
     recording in place of the threads of this machine.  Returns how many pairs have which outcome:
     "" is accepted, all others are reasons.
@@ -70,9 +72,14 @@ def sample(
         raise
 
 
-def _opened(paths: Sequence[Path | str], rescan: bool) -> dict[str, Recording]:
-    """Return recordings by path.  Raises ConfigError for two of one name."""
-    opened = {str(path): (rescannable if rescan else open_recording)(Path(path)) for path in paths}
+def _opened(paths: Sequence[Path | str | Recording], rescan: bool) -> dict[str, Recording]:
+    """Return recordings by path, or by name if open.  Raises ConfigError for two of one name."""
+    opened: dict[str, Recording] = {}
+    for path in paths:
+        if isinstance(path, str | Path):
+            opened[str(path)] = (rescannable if rescan else open_recording)(Path(path))
+        else:
+            opened[path.name] = path
     names = Counter(recording.name for recording in opened.values())
     if len(opened) < len(paths) or max(names.values(), default=0) > 1:
         name = names.most_common(1)[0][0]
@@ -86,8 +93,12 @@ def _add(dataset: Dataset, recording: Recording) -> None:
     known = dataset.recordings.get(recording.name, {})
     if scans := known.get("scans") or scan_prints(recording):
         facts["scans"] = scans
+    source = recording
+    if isinstance(recording, AlignedPart):
+        source = recording.recording
+        facts |= pose_facts(recording)
     if dataset.sampling.noise_m > 0.0:
-        facts["noise"] = "rescans" if isinstance(recording, Simulation) else "added"
+        facts["noise"] = "rescans" if isinstance(source, Simulation) else "added"
     dataset.add_recording(recording.name, facts)
 
 

@@ -1,0 +1,86 @@
+"""A recording with joint poses as its ground truth, for whatever asks a recording for poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cello3d_ros.config import Pipeline
+from cello3d_ros.geometry.pose_track import PoseTrack
+from cello3d_ros.learning.align import Alignment, Progress, align
+from cello3d_ros.learning.align_scans import RawScan, undistorted
+from cello3d_ros.learning.align_sweeps import motion_of
+from cello3d_ros.recordings.recording import Recording, Scan
+
+
+@dataclass(frozen=True)
+class AlignedPart:
+    """The scans of one part of an alignment, with its poses and without the motion within them.
+
+    Scans that are left out are missing.
+    """
+
+    recording: Recording
+    alignment: Alignment
+    part: int = 0
+
+    has_odometry = False
+    n_projected = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the recording; a part beyond the first has its number, from 2, behind it."""
+        return self.recording.name + (f".{self.part + 1}" if self.part else "")
+
+    def __len__(self) -> int:
+        return len(self.alignment.members(self.part))
+
+    def __iter__(self) -> Iterator[Scan]:
+        found, members = self.alignment, self.alignment.members(self.part)
+        kept = set(members.tolist())
+        for k, scan in enumerate(self.recording):
+            if k not in kept:
+                continue
+            points = scan.points
+            if found.compensated and scan.time_s is not None:
+                velocity = motion_of(k, found.poses, found.stamps_ns, members)
+                points = undistorted(RawScan(points, scan.time_s), velocity)
+            T = found.poses[k]
+            yield replace(scan, points=points, time_s=None, T_world_sensor=T, T_odom_sensor=None)
+
+    def track(self) -> PoseTrack:
+        """Return the joint poses."""
+        members = self.alignment.members(self.part)
+        return PoseTrack.of_poses(
+            self.alignment.stamps_ns[members], self.alignment.poses[members], np.inf
+        )
+
+
+def aligned_parts(
+    recording: Recording,
+    folder: Path,
+    pipeline: Pipeline | None = None,
+    n_threads: int = 1,
+    progress: Callable[[int, int], None] | Progress = lambda done, total: None,
+) -> list[AlignedPart]:
+    """Align a recording, once for a folder, and return its parts.
+
+    folder: keeps the poses; scans are kept there only while they are needed.
+    """
+    found = align(recording, pipeline, folder=folder, n_threads=n_threads, progress=progress)
+    return [AlignedPart(recording, found, part) for part in range(found.n_parts)]
+
+
+def pose_facts(part: AlignedPart) -> dict[str, Any]:
+    """Return what a dataset should know of the poses."""
+    sigma_m, sigma_rad = part.alignment.sigmas()
+    return {
+        "poses": "joint",
+        "step_sigma_m": sigma_m,
+        "step_sigma_rad": sigma_rad,
+        "left_out": {str(k): reason for k, reason in part.alignment.reasons.items()},
+    }
