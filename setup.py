@@ -2,10 +2,10 @@ import sys
 from glob import glob
 from pathlib import Path
 
-from setuptools import find_packages, setup
-
 if sys.version_info < (3, 11):  # noqa: UP036 - before pip searches for old requirements
     sys.exit("cello3d_ros needs Python 3.11 or newer, not {}.{}".format(*sys.version_info))
+
+from setuptools import find_packages, setup
 
 NAME = "cello3d_ros"
 

@@ -1,6 +1,7 @@
 """The suite is collected with and without ROS, its pytest plugins and optional libraries."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -30,6 +31,15 @@ def pytest_pycollect_makemodule({argument}, parent):
     module = import_path(Path({argument}), **words)
     assert not hasattr(module, "generate_test_description")
     return pytest.Module.from_parent(parent, path=Path({argument}))
+"""
+
+EXAMPLE = """
+import numpy as np, cello3d_ros as cello
+from cello3d_ros.tracking.warmup import room
+rng = np.random.default_rng(0)
+r = cello.Estimator()(room(rng), room(rng), np.eye(4))
+assert np.linalg.eigvalsh(r.covariance)[0] > 0
+print(r.trust.sentence)
 """
 
 
@@ -66,3 +76,30 @@ def test_a_plugin_that_imports_each_module_collects_the_suite(tmp_path: Path, hi
     assert "test/learning/test_cluster.py::" in said
     assert "test/simulation/test_rescan.py::" in said
     assert ("rclpy is not installed" in said) == bool(hidden)
+
+
+def ask(python: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run another Python of this machine; skip where it is not there."""
+    program = shutil.which(python)
+    command = [program or "", *arguments]
+    if not program or subprocess.run([program, "-c", ""], capture_output=True).returncode:
+        pytest.skip(f"{python} is not installed")
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("python", ["python3.8", "python3.9", "python3.10"])
+def test_a_python_that_is_too_old_is_refused_in_one_sentence(python: str) -> None:
+    done = ask(python, "setup.py", "--version")
+    assert done.returncode == 1
+    words = f"cello3d_ros needs Python 3.11 or newer, not {python.removeprefix('python')}"
+    assert done.stderr.strip() == words
+
+
+@pytest.mark.parametrize("python", ["python3.11", "python3.12", "python3.13"])
+def test_the_example_runs_with_every_python_that_has_what_it_needs(python: str) -> None:
+    if ask(python, "-c", "import numba, rosbags, tqdm, yaml").returncode:
+        pytest.skip(f"{python} lacks the requirements of setup.py")
+    done = ask(python, "-c", EXAMPLE)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.strip()
