@@ -238,7 +238,7 @@ class CovarianceConfig(Section):
 
     covariance_mode: str = _setting(
         "cello3d",
-        "how the covariance is found",
+        "how the covariance is found; fused is experimental",
         choices=COVARIANCE_MODES,
     )
     sensor_sigma_m: float = _setting(

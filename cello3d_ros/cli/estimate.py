@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=COVARIANCE_MODES,
         default="cello3d",
-        help="how the covariance is found",
+        help="how the covariance is found; fused is experimental",
     )
     parser.add_argument("--seed", type=int, default=0, help="of the random subsamples")
     parser.add_argument("--json", action="store_true", help="print JSON")
