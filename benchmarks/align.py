@@ -143,7 +143,7 @@ def main() -> None:
         for scanner in arguments.scanners.split(","):
             for step in map(float, arguments.steps.split(",")):
                 for seed in map(int, arguments.seeds.split(",")):
-                    n = max(arguments.scans, 40) if step < 0.05 else arguments.scans
+                    n = max(arguments.scans, int(min(60, 2.4 / step)))
                     name = f"{kind}-{scanner}-{step:g}-{seed}"
                     row = done.get(name) or measured(kind, scanner, step, n, seed)
                     if name not in done and arguments.out:
