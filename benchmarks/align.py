@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,10 +24,12 @@ from cello3d_ros.config import Pipeline
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.align import align
+from cello3d_ros.recordings.poses import tum_line
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.registration.icp import register
 from cello3d_ros.simulation.paths import Route, walk
-from cello3d_ros.simulation.scanner import SCANNERS, raycasting_scene, scan
+from cello3d_ros.simulation.products import SCANNERS
+from cello3d_ros.simulation.simulation import Simulation
 from cello3d_ros.simulation.worlds import build_world
 
 KINDS = "rooms,hall,corridor,stairs,garden,wood"
@@ -37,18 +40,20 @@ class Frozen:
     """A recording of a world from given poses; scans carry no pose."""
 
     n_projected = 0
+    has_odometry = False
 
     def __init__(self, kind: str, scanner: str, seed: int, step_m: float, n_scans: int) -> None:
-        """Scan a world each ``step_m`` along its route."""
-        layout, way = np.random.default_rng(seed).spawn(2)
-        world = build_world(kind, layout)
-        scene = raycasting_scene(world.mesh)
+        """Scan a world each ``step_m`` along its route, at one instant each."""
+        layout, way, _ = np.random.default_rng(seed).spawn(3)
+        truth = poses_along(build_world(kind, layout).route, step_m, n_scans, way)
+        with tempfile.NamedTemporaryFile("w", suffix=".tum") as path:
+            path.writelines(tum_line((k + 1) * PERIOD_NS, T) for k, T in enumerate(truth))
+            path.flush()
+            simulation = Simulation(kind, seed, n_scans, SCANNERS[scanner], Path(path.name))
+            scans = list(simulation)
         self.name = f"{kind}-{scanner}-{step_m:g}-{seed}"
-        self.truth = poses_along(world.route, step_m, n_scans, way)
-        self.clouds = [
-            scan(scene, SCANNERS[scanner], T, np.random.default_rng([seed, k]))
-            for k, T in enumerate(self.truth)
-        ]
+        self.truth = np.array([scan.T_world_sensor for scan in scans])
+        self.clouds = [scan.points for scan in scans]
 
     def __len__(self) -> int:
         return len(self.clouds)

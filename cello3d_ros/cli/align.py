@@ -94,6 +94,29 @@ def joint(
     return found
 
 
+def posed(recording: Recording, poses: Path | None, n_threads: int) -> Recording:
+    """Return a recording with poses: its own, those of a file, or for the word joint its clouds'.
+
+    Of a recording that falls into parts the longest is returned.
+    """
+    if poses is None:
+        return recording
+    if str(poses) != "joint":
+        from cello3d_ros.recordings.start_poses import PosedRecording, start_track
+
+        return PosedRecording(recording, start_track(poses, recording))
+    from threadpoolctl import threadpool_limits
+
+    from cello3d_ros.learning.align import align
+    from cello3d_ros.learning.align_report import sentences
+    from cello3d_ros.learning.aligned import AlignedPart
+
+    with bar(recording.name) as progress, threadpool_limits(1, user_api="blas"):
+        found = align(recording, n_threads=n_threads, progress=progress)
+    print("\n".join(sentences(found)))
+    return AlignedPart(recording, found)
+
+
 @contextmanager
 def bar(name: str) -> Iterator[Callable[[int, int], None]]:
     """Give a function of (done, total) that shows progress and time left on a terminal."""

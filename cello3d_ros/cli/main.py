@@ -21,6 +21,7 @@ VERBS = {
     "train": "learn a model from datasets",
     "tune": "fit a model to one recording of your own",
     "evaluate": "judge covariances beside every baseline",
+    "graph": "write registrations with covariances as a pose graph",
     "report": "turn an evaluation into one page to look at",
     "reproduce": "make the paper's tables and figures again",
     "replay": "run the estimator over a recording, without ROS",

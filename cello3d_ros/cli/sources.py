@@ -37,7 +37,11 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
         help="pose of the sensor in the frame whose poses a bag has",
     )
     parser.add_argument(
-        "--poses", type=Path, metavar="FILE", help="TUM or KITTI poses of a folder of clouds"
+        "--poses",
+        type=Path,
+        metavar="FILE",
+        help="TUM or KITTI poses of a folder of clouds; in align and graph of any recording, in "
+        "graph also the word joint",
     )
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.recordings import tables
 from cello3d_ros.recordings.poses import read_tum, rigid
-from cello3d_ros.recordings.recording import Recording
+from cello3d_ros.recordings.recording import Recording, Scan
 
 
 def start_track(path: Path, recording: Recording) -> PoseTrack:
@@ -28,3 +30,31 @@ def start_track(path: Path, recording: Recording) -> PoseTrack:
     if all(track.at(scan.stamp_ns) is None for scan in recording):
         raise RecordingError(f"{path}: no pose has the time of any scan of {recording.name}")
     return track
+
+
+@dataclass(frozen=True)
+class PosedRecording:
+    """A recording with the poses of another program as its ground truth, and no odometry."""
+
+    recording: Recording
+    poses: PoseTrack
+
+    has_odometry = False
+    n_projected = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the recording."""
+        return self.recording.name
+
+    def __len__(self) -> int:
+        return len(self.recording)
+
+    def __iter__(self) -> Iterator[Scan]:
+        for scan in self.recording:
+            T = self.poses.at(scan.stamp_ns)
+            yield replace(scan, T_world_sensor=T, T_odom_sensor=None)
+
+    def track(self) -> PoseTrack:
+        """Return the poses."""
+        return self.poses
