@@ -81,6 +81,16 @@ def test_identical_clouds_have_finite_features(pair):
     assert np.isfinite(describe(pair[0], pair[0], np.eye(4), Pipeline()).features).all()
 
 
+def test_copies_that_leave_no_residual_have_finite_features_too(pair):
+    """Each point meets itself: every spread is 0, and its logarithm has a bound."""
+    found = describe(pair[0], pair[0], np.eye(4), Pipeline(icp=IcpConfig(n_neighbors=1)))
+    assert not found.shapes["sandwich"].any()
+    features = by_name(found)
+    assert np.isfinite(found.features).all()
+    for name in ("log_sandwich_m", "log_sandwich_rad", "log_residual_m"):
+        assert features[name] == pytest.approx(np.log(1e-6))
+
+
 def test_inputs_are_the_turned_descriptors_or_one_row():
     descriptors, features = np.arange(24.0).reshape(2, 3, 4), np.array([[7.0, 8.0], [9.0, 10.0]])
     np.testing.assert_array_equal(model_inputs("descriptor", descriptors, features), descriptors)
