@@ -32,7 +32,7 @@ _TRAJECTORY = (
     ("runs", "n_runs", "10d"),
     ("failed", "n_failed", "10d"),
     ("lost", "n_lost", "10d"),
-    ("told lost", "n_told", "10d"),
+    ("found lost", "n_told", "10d"),
     ("D_M", "dm_6dof", "10.2f"),
     ("transl.", "dm_translation", "10.2f"),
     ("rotation", "dm_rotation", "10.2f"),

@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def write_answers(out: Path, steps: Any, config: NodeConfig) -> Counter[str]:
-    """Write the three files as the steps come; return how many clouds met which fate."""
+    """Write the three files as the steps come; return how many clouds had which outcome."""
     from cello3d_ros.atomic import new_folder
     from cello3d_ros.recordings.bag_writer import write_messages
 

@@ -1,4 +1,4 @@
-"""What every method is told of a registered pair: found once, from the clouds and the pose."""
+"""What is known of a registered pair: found once, from the clouds and the pose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Registrations that probably ended in another minimum, told by the sandwich where they ended.
+"""Registrations that probably ended in a wrong minimum, found by their sandwich.
 
 In a wrong minimum surfaces do not lie on each other: what residuals are left pull in all
 directions, and ``H^-1 (sum g g^T) H^-1`` is several times as large as in the right one.

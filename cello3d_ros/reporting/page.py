@@ -42,7 +42,7 @@ _TRAJECTORIES: _Columns = (
     ("runs", "n_runs", "d"),
     ("failed", "n_failed", "d"),
     ("lost", "n_lost", "d"),
-    ("told lost", "n_told", "d"),
+    ("found lost", "n_told", "d"),
     ("NEES/6 (ideal 1)", "nees_over_6", ".3g"),
     ("covariances are", "verdict", "s"),
     ("D_M (ideal 2.35)", "dm_6dof", ".2f"),
@@ -55,7 +55,7 @@ _TRAJECTORIES: _Columns = (
 _MEANING = {
     "cello3d": "the prediction of the model that is judged",
     "cello3d_widened": "the same as a node publishes it: at least the mean of the training data "
-    "where a pair is unlike all of those",
+    "where a pair is unknown to the model",
     "mean_covariance": "one covariance for every pair, the mean of the training data (the "
     "baseline)",
     "constant": "the mean of the training data relative to the shape of each pair",

@@ -20,7 +20,7 @@ _STOP_TIMEOUT_S = 10.0
 
 
 class NodeDiedError(Cello3dError):
-    """The node ended although nobody told it to."""
+    """The node ended by itself."""
 
 
 def environment(domain_id: int) -> dict[str, str]:

@@ -1,7 +1,7 @@
 """From messages to answers, one cloud at a time: newest first, whatever is heard.
 
-Knows messages but no graph: whoever owns a worker hands it what was heard and the time of now,
-publishes what it answers and is told of every cloud that it drops.
+Knows messages but no graph: its owner passes in messages and the time, publishes the answers and
+hears of every cloud that is dropped.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ class Worker:
 
     def reset(self) -> None:
         """Forget the reference and the chain; the next cloud starts anew."""
-        self._tracker.reset("it was told to")
+        self._tracker.reset("on request")
 
     def _forget(self, reason: str, event: str) -> None:
         for skip in self._intake.clear(reason, f"{event} while it waited"):

@@ -30,7 +30,7 @@ class Step(NamedTuple):
 
 
 def replay(recording: Recording, tracker: Tracker, config: NodeConfig) -> Iterator[Step]:
-    """Yield the fate of every cloud; the first one's reason is "reference"."""
+    """Yield what became of every cloud; the first one's reason is "reference"."""
     for scan, place in _places(recording, config):
         if isinstance(place, Place):
             yield _step(scan, place, tracker)
