@@ -47,8 +47,8 @@ class Drive:
     yaw_deg: float = 0.0
     sweeps: bool = True
     body: bool = False
-    odometry_share: float = 0.02
-    odometry_deg_per_m: float = 0.1
+    odometry_share: float = 0.005
+    odometry_deg_per_m: float = 0.05
 
     def __post_init__(self) -> None:
         laws = {

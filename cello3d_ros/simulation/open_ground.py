@@ -68,16 +68,7 @@ def square(rng: np.random.Generator) -> World:
     points = route.points.copy()
     points[:, 2] = ground(points[:, :2])
     route = Route(points, closed=True)
-    for side in range(4):
-        length, away = (2 * half[0], half[1]) if side % 2 == 0 else (2 * half[1], half[0])
-        if side == 3 and rng.uniform() < 0.5:
-            continue  # open to one side
-        at = -length / 2
-        while at < length / 2 - 5:
-            width = min(rng.uniform(9, 22), length / 2 - at)
-            front = moved(house(width, 9.0, rng.uniform(8, 20), rng), [at, away, -0.5])
-            parts.append(moved(front, np.zeros(3), side * np.pi / 2))
-            at += width + (rng.uniform(3, 8) if rng.uniform() < 0.3 else 0.0)
+    parts += _facades(half, rng)
     basin = rng.uniform(2.0, 4.0)
     parts.append(frustum([0, 0, -0.5], [0, 0, 0.6], basin, basin, 24))
     parts.append(frustum([0, 0, 0.5], [0, 0, rng.uniform(2, 5)], 0.5, 0.2, 12))
@@ -98,6 +89,22 @@ def square(rng: np.random.Generator) -> World:
         way.points[:, 2] = ground(way.points[:, :2])
     people = walkers(int(rng.integers(6, 20)), ways, rng)
     return clear_of(route, join(parts)), route, None, tuple(people)
+
+
+def _facades(half: Array, rng: np.random.Generator) -> list[Mesh]:
+    """Return rows of houses around a square, on three sides or four."""
+    parts = []
+    for side in range(4):
+        length, away = (2 * half[0], half[1]) if side % 2 == 0 else (2 * half[1], half[0])
+        if side == 3 and rng.uniform() < 0.5:
+            continue  # open to one side
+        at = -length / 2
+        while at < length / 2 - 5:
+            width = min(rng.uniform(9, 22), length / 2 - at)
+            front = moved(house(width, 9.0, rng.uniform(8, 20), rng), [at, away, -0.5])
+            parts.append(moved(front, np.zeros(3), side * np.pi / 2))
+            at += width + (rng.uniform(3, 8) if rng.uniform() < 0.3 else 0.0)
+    return parts
 
 
 def harbour(rng: np.random.Generator) -> World:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import NamedTuple
+
 import numpy as np
 
 from cello3d_ros.geometry.se3 import Array
@@ -25,7 +28,15 @@ from cello3d_ros.simulation.things import (
     walkers,
 )
 
+FAR = Route(np.array([[0, 500.0, 0], [1, 500.0, 0]]), closed=False)  # in the way of nothing
+
 World = tuple[Mesh, Route, Mesh | None, tuple[Mover, ...]]
+
+
+class _Street(NamedTuple):
+    road: float  # half width, metres
+    walk: float  # width of a sidewalk
+    ground: Ground
 
 
 def street(rng: np.random.Generator) -> World:
@@ -36,9 +47,10 @@ def street(rng: np.random.Generator) -> World:
     route = _on(ground, smooth(_rectangle(half + 0.5 * road), closed=True))
     middle = _on(ground, smooth(_rectangle(half), closed=True))
     parts = [_floor(ground, 3.0 * half, 0.006, rng)]
-    parts += _sidewalks(half, road, walk, ground)
+    plan = _Street(road, walk, ground)
+    parts += _sidewalks(half, plan)
     for side in range(4):
-        parts += _row(side, half, road, walk, route, ground, rng)
+        parts += _row(side, half, plan, rng)
     ways = [beside(middle, sign_ * (road + 0.5 * walk)) for sign_ in (-1, 1)]
     movers = [
         *traffic(3, beside(route, road), (4.0, 9.0), rng),
@@ -68,10 +80,10 @@ def _floor(ground: Ground, half: Array, roughness_m: float, rng: np.random.Gener
     return painted(terrain(x, y, z + roughness_m * rng.normal(size=z.shape)), ASPHALT)
 
 
-def _sidewalks(half: Array, road: float, walk: float, ground: Ground) -> list[Mesh]:
-    """Return the raised sidewalks: around the block, and around the four beyond each corner."""
+def _sidewalks(half: Array, plan: _Street) -> list[Mesh]:
+    """Return the raised sidewalks: around the block, and around the eight blocks about it."""
     parts = []
-    inner = half - road
+    inner, walk, ground = half - plan.road, plan.walk, plan.ground
     for sx in (-1, 0, 1):
         for sy in (-1, 0, 1):
             center = 2 * half * [sx, sy]
@@ -83,65 +95,68 @@ def _sidewalks(half: Array, road: float, walk: float, ground: Ground) -> list[Me
     return parts
 
 
-def _row(
-    side: int,
-    half: Array,
-    road: float,
-    walk: float,
-    route: Route,
-    ground: Ground,
-    rng: np.random.Generator,
-) -> list[Mesh]:
+Placed = tuple[Mesh, float, float, float]  # a thing, x along a street, y to its left, its turn
+
+
+def _row(side: int, half: Array, plan: _Street, rng: np.random.Generator) -> list[Mesh]:
     """Return what stands along both edges of one of the four streets."""
     yaw = side * np.pi / 2
     length, away = (2 * half[0], half[1]) if side % 2 == 0 else (2 * half[1], half[0])
-    parts: list[Mesh] = []
-
-    def put(mesh: Mesh, x: float, y: float, turn: float = 0.0) -> None:
-        """Place a thing at x along the street, y to the left of its middle."""
-        spot = np.array([x * np.cos(yaw) - (y - away) * np.sin(yaw),
-                         x * np.sin(yaw) + (y - away) * np.cos(yaw)])  # fmt: skip
-        parts.append(moved(mesh, [*spot, float(ground(spot))], yaw + turn))
-
-    for outer in (False, True):
-        edge, face = (-1.0, np.pi) if outer else (1.0, 0.0)
-        reach = length / 2 - road - 1.0
-        x = -reach - (30.0 if outer else 0.0)
-        end = reach + (30.0 if outer else 0.0)
-        while x < end - 6.0:
-            crossing = reach < abs(x + 5.0) < reach + 2 * road + 2.0
-            width = min(rng.uniform(8.0, 20.0), end - x)
-            if x < reach < x + width:
-                width = max(6.0, reach - x)
-            if not crossing and rng.uniform() < 0.85:
-                built = house(width, rng.uniform(7, 10), rng.uniform(5, 20), rng)
-                front = edge * (road + walk + rng.uniform(0.0, 1.5))
-                put(built, x if not outer else x + width, front, face)
-            elif not crossing:
-                put(
-                    fence([0, 0, 0], [width, 0, 0], rng.uniform(0.9, 1.6)), x, edge * (road + walk)
-                )
-                shrub = bush([0, 0, 0], rng.uniform(0.6, 1.5, size=3), rng)
-                put(shrub, x + width / 2, edge * (road + walk + 3.0))
-            x += width
-        for x in np.arange(-reach + rng.uniform(2, 6), reach - 2, 5.6):
-            if rng.uniform() < 0.55:  # parked half on the sidewalk
-                turn = np.pi * float(rng.uniform() < 0.5) + rng.normal(scale=0.03)
-                put(car(rng), x, edge * (road + 0.35), turn)
-        for x in np.arange(-reach + rng.uniform(1, 8), reach, rng.uniform(9, 16)):
-            if rng.uniform() < 0.6:
-                foot = np.zeros(3)
-                still = Route(np.array([[0, 50.0, 0], [1, 50.0, 0]]), closed=False)
-                put(painted(tree(foot, rng.uniform(5, 9), 180, still, rng), LEAF),
-                    x, edge * (road + 1.6))  # fmt: skip
-            else:
-                put(lamp([0, 0, 0], rng.uniform(5, 8), -edge * np.pi / 2), x, edge * (road + 1.5))
-        for x in (-reach, reach):
-            put(sign([0, 0, 0], rng.uniform(-np.pi, np.pi), rng), x, edge * (road + 1.3))
-        for _ in range(int(rng.integers(1, 5))):
-            bin_ = box([0, 0, 0.55], rng.uniform([0.4, 0.4, 0.9], [1.2, 0.8, 1.3]))
-            put(bin_, rng.uniform(-reach, reach), edge * (road + walk - 0.4))
+    reach = length / 2 - plan.road - 1.0
+    parts = []
+    for edge in (1.0, -1.0):  # toward the block, and away from it
+        things = [*_houses(reach, edge, plan, rng), *_furniture(reach, edge, plan, rng)]
+        for mesh, x, y, turn in things:
+            spot = x * np.array([np.cos(yaw), np.sin(yaw)])
+            spot += (y - away) * np.array([-np.sin(yaw), np.cos(yaw)])
+            parts.append(moved(mesh, [*spot, float(plan.ground(spot))], yaw + turn))
     return parts
+
+
+def _houses(
+    reach: float, edge: float, plan: _Street, rng: np.random.Generator
+) -> Iterator[Placed]:
+    """Yield the houses of one edge, on the outer one beyond the crossings too, and gardens."""
+    further = 30.0 if edge < 0 else 0.0
+    x, end = -reach - further, reach + further
+    front = edge * (plan.road + plan.walk)
+    while x < end - 6.0:
+        crossing = reach < abs(x + 5.0) < reach + 2 * plan.road + 2.0
+        width = min(rng.uniform(8.0, 20.0), end - x)
+        if x < reach < x + width:
+            width = max(6.0, reach - x)
+        if not crossing and rng.uniform() < 0.85:
+            built = house(width, rng.uniform(7, 10), rng.uniform(5, 20), rng)
+            set_back = edge * rng.uniform(0.0, 1.5)
+            corner = (x, 0.0) if edge > 0 else (x + width, np.pi)
+            yield built, corner[0], front + set_back, corner[1]
+        elif not crossing:
+            yield fence([0, 0, 0], [width, 0, 0], rng.uniform(0.9, 1.6)), x, front, 0.0
+            shrub = bush([0, 0, 0], rng.uniform(0.6, 1.5, size=3), rng)
+            yield shrub, x + width / 2, front + 3.0 * edge, 0.0
+        x += width
+
+
+def _furniture(
+    reach: float, edge: float, plan: _Street, rng: np.random.Generator
+) -> Iterator[Placed]:
+    """Yield parked cars, trees, lamps, signs and bins of one edge."""
+    kerb = edge * plan.road
+    for x in np.arange(-reach + rng.uniform(2, 6), reach - 2, 5.6):
+        if rng.uniform() < 0.55:  # parked half on the sidewalk
+            turn = np.pi * float(rng.uniform() < 0.5) + rng.normal(scale=0.03)
+            yield car(rng), x, kerb + 0.35 * edge, turn
+    for x in np.arange(-reach + rng.uniform(1, 8), reach, rng.uniform(9, 16)):
+        if rng.uniform() < 0.6:
+            grown = tree(np.zeros(3), rng.uniform(5, 9), 180, FAR, rng)
+            yield painted(grown, LEAF), x, kerb + 1.6 * edge, 0.0
+        else:
+            yield lamp([0, 0, 0], rng.uniform(5, 8), -edge * np.pi / 2), x, kerb + 1.5 * edge, 0.0
+    for x in (-reach, reach):
+        yield sign([0, 0, 0], rng.uniform(-np.pi, np.pi), rng), x, kerb + 1.3 * edge, 0.0
+    for _ in range(int(rng.integers(1, 5))):
+        bin_ = box([0, 0, 0.55], rng.uniform([0.4, 0.4, 0.9], [1.2, 0.8, 1.3]))
+        yield bin_, rng.uniform(-reach, reach), kerb + edge * (plan.walk - 0.4), 0.0
 
 
 def highway(rng: np.random.Generator) -> World:
@@ -171,6 +186,18 @@ def highway(rng: np.random.Generator) -> World:
                          CONCRETE))  # fmt: skip
     else:
         parts += _rail(axis, 0.3) + _rail(axis, -0.3)
+    parts += _roadside(axis, edge, slope, rng)
+    own = beside(axis, -(median + 1.0 + 3.6 * 0.5))
+    middles = [median + 1.0 + 3.6 * (lane + 0.5) for lane in range(lanes)]
+    movers = [m for y in middles for m in traffic(9, beside(axis, y), (22, 36), rng)]
+    movers = [Mover(m.mesh, m.route, m.start_m, -m.speed_m_s) for m in movers]
+    movers += [m for y in middles[1:] for m in traffic(9, beside(axis, -y), (22, 36), rng)]
+    return join(parts), Route(_fine(own.points[60:-60]), closed=False), None, tuple(movers)
+
+
+def _roadside(axis: Route, edge: float, slope: Array, rng: np.random.Generator) -> list[Mesh]:
+    """Return gantries, marker posts, at times a noise barrier, and trees on the slopes."""
+    at, heading, parts = axis.points, axis.heading_rad, []
     for k in range(int(rng.uniform(10, 60)), len(at) - 5, int(rng.uniform(90, 220))):
         parts.append(_gantry(at[k], float(heading[k]), edge, rng))
     for k in range(0, len(at), 50):
@@ -182,20 +209,12 @@ def highway(rng: np.random.Generator) -> World:
         part = slice(first, first + int(rng.integers(80, 250)))
         wall = [(edge + 1.2, -1.0), (edge + 1.2, 3.5), (edge + 1.4, 3.5), (edge + 1.4, -1.0)]
         parts.append(painted(extruded(wall, at[part], heading[part]), CONCRETE))
-    still = Route(np.array([[0, 500.0, 0], [1, 500.0, 0]]), closed=False)
     for _ in range(int(rng.integers(30, 90))):
         k, side = int(rng.integers(len(at))), int(rng.choice([-1, 1]))
-        off = rng.uniform(edge + 14, edge + 40)
-        left = np.array([-np.sin(heading[k]), np.cos(heading[k]), 0.0])
-        foot = at[k] + side * off * left + [0, 0, 12 * slope[(side + 1) // 2] - 0.3]
-        grown = painted(tree(np.zeros(3), rng.uniform(5, 14), 160, still, rng), LEAF)
-        parts.append(moved(grown, foot))
-    own = beside(axis, -(median + 1.0 + 3.6 * 0.5))
-    middles = [median + 1.0 + 3.6 * (lane + 0.5) for lane in range(lanes)]
-    movers = [m for y in middles for m in traffic(9, beside(axis, y), (22, 36), rng)]
-    movers = [Mover(m.mesh, m.route, m.start_m, -m.speed_m_s) for m in movers]
-    movers += [m for y in middles[1:] for m in traffic(9, beside(axis, -y), (22, 36), rng)]
-    return join(parts), Route(_fine(own.points[60:-60]), closed=False), None, tuple(movers)
+        foot = [0.0, side * rng.uniform(edge + 14, edge + 40), 12 * slope[(side + 1) // 2] - 0.3]
+        grown = painted(tree(np.zeros(3), rng.uniform(5, 14), 160, FAR, rng), LEAF)
+        parts.append(moved(moved(grown, foot), at[k], float(heading[k])))
+    return parts
 
 
 def _fine(points: Array) -> Array:
@@ -248,24 +267,33 @@ def tunnel(rng: np.random.Generator) -> World:
     for end, k in ((-0.2, 0), (0.2, -1)):
         parts.append(moved(box([end, 0, 3], [0.2, 30, 14]), at[k], float(heading[k])))
     if not plain:
-        side = float(rng.choice([-1, 1]))
-        tray = [
-            (side * (half - 0.05), 2.2),
-            (side * (half - 0.35), 2.2),
-            (side * (half - 0.35), 2.1),
-        ]
-        parts.append(extruded(tray, at, heading))
-        for k in range(5, len(at), int(rng.integers(8, 20))):
-            light = box([0, side * 0.4 * half, spring + 0.85 * (top - spring)], [1.4, 0.25, 0.15])
-            parts.append(moved(light, at[k], float(heading[k])))
-        for k in range(int(rng.integers(5, 20)), len(at), int(rng.integers(25, 60))):
-            door = box([0, side * (half - 0.05), 1.2], [rng.uniform(1.0, 3.0), 0.3, 2.4])
-            parts.append(moved(door, at[k], float(heading[k])))
-            plate = painted(box([3, -side * (half - 0.4), 2.4], [0.05, 0.6, 0.6]), 0.9)
-            parts.append(moved(plate, at[k], float(heading[k])))
+        parts += _fittings(axis, half, spring + 0.85 * (top - spring), rng)
     lane = Route(beside(axis, -0.45 * half).points[100:-100], closed=False)  # 10 m off its ends
     movers = (
         [] if plain else traffic(int(rng.integers(1, 4)), beside(axis, 0.45 * half), (8, 20), rng)
     )
     oncoming = tuple(Mover(m.mesh, m.route, m.start_m, -m.speed_m_s) for m in movers)
     return join(parts), lane, None, oncoming
+
+
+def _fittings(
+    axis: Route, half: float, lamp_height: float, rng: np.random.Generator
+) -> list[Mesh]:
+    """Return a cable tray, lamps, doors and signs of a tunnel."""
+    at, heading, parts = axis.points[::10], axis.heading_rad[::10], []
+    side = float(rng.choice([-1, 1]))
+    tray = [
+        (side * (half - 0.05), 2.2),
+        (side * (half - 0.35), 2.2),
+        (side * (half - 0.35), 2.1),
+    ]
+    parts.append(extruded(tray, at, heading))
+    for k in range(5, len(at), int(rng.integers(8, 20))):
+        light = box([0, side * 0.4 * half, lamp_height], [1.4, 0.25, 0.15])
+        parts.append(moved(light, at[k], float(heading[k])))
+    for k in range(int(rng.integers(5, 20)), len(at), int(rng.integers(25, 60))):
+        door = box([0, side * (half - 0.05), 1.2], [rng.uniform(1.0, 3.0), 0.3, 2.4])
+        parts.append(moved(door, at[k], float(heading[k])))
+        plate = painted(box([3, -side * (half - 0.4), 2.4], [0.05, 0.6, 0.6]), 0.9)
+        parts.append(moved(plate, at[k], float(heading[k])))
+    return parts

@@ -2,13 +2,17 @@
 
 from dataclasses import replace
 from importlib.util import find_spec
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from surface_distance import surface_distances
 
+from cello3d_ros.clouds.shape import prepare
+from cello3d_ros.config import Pipeline
 from cello3d_ros.geometry import se3
 from cello3d_ros.recordings.deskew import deskew
+from cello3d_ros.registration.backends import register
 from cello3d_ros.simulation.casting import Surroundings, cast
 from cello3d_ros.simulation.drives import MOTIONS, Drive
 from cello3d_ros.simulation.meshes import Mesh, block, box
@@ -45,7 +49,8 @@ def test_undoing_the_motion_with_the_exact_track_puts_points_on_the_surfaces(sca
 
 
 def test_odometry_undoes_the_motion_of_a_scan_but_for_its_drift() -> None:
-    simulation = Simulation("parking", 3, 6, EXACT, drive=FAST)
+    drive = replace(FAST, odometry_share=0.02)
+    simulation = Simulation("parking", 3, 6, EXACT, drive=drive)
     off, moved = [], []
     for scan in list(simulation)[1:]:
         truth, odometry = (deskew(scan, t) for t in (simulation.true_track(), simulation.track()))
@@ -179,6 +184,26 @@ def test_what_moves_is_met_where_it_is_when_the_beam_is_sent() -> None:
     assert len(places) > 10
 
 
+def test_points_of_a_sweep_lie_on_what_moves_at_their_own_times() -> None:
+    scanner = replace(EXACT, n_beams=32, azimuth_step_deg=0.5)
+    simulation = Simulation("highway", 4, 3, scanner, drive=Drive(speed_m_s=25.0, height_m=1.8))
+    world, track = simulation.build()[0], simulation.true_track()
+    start_ns, n_on_movers = simulation.stamps_ns()[0], 0
+    for scan in simulation:
+        places = se3.transform(scan.T_world_sensor, deskew(scan, track).points)
+        time_s = 1e-9 * (scan.stamp_ns - start_ns) + scan.time_s
+        for mover in world.movers:
+            T = se3.inverse(mover.poses(time_s))
+            local = np.einsum("nij,nj->ni", T[:, :3, :3], places) + T[:, :3, 3]
+            low, high = mover.mesh.vertices.min(axis=0), mover.mesh.vertices.max(axis=0)
+            inside = np.all((local > low - 1e-3) & (local < high + 1e-3), axis=1)
+            inside &= local[:, 2] > 0.3  # above the road
+            if inside.any():
+                assert surface_distances(mover.mesh, local[inside]).max() < 1e-3
+                n_on_movers += int(inside.sum())
+    assert n_on_movers > 100
+
+
 def test_glass_is_seen_through_mirrors_and_returns_head_on() -> None:
     room, pane = block([-9, -9, -9], [9, 9, 9]), block([3.0, -8, -8], [3.01, 8, 8])
     clear, glazed = Surroundings(room), Surroundings(room, glass=pane)
@@ -205,3 +230,36 @@ def test_the_points_of_a_still_scanner_change_by_noise_alone() -> None:
     assert same.mean() > 0.95  # the others are on people
     points = measure(first, np.random.default_rng(0))
     assert len(points) > 0.7 * len(first.distances)
+
+
+def rms_error(scans, clouds) -> float:
+    """Return the error of registering neighbouring scans from the truth, metres."""
+    icp = replace(Pipeline().icp, n_reference_points=0, n_reading_points=5000)
+    prepared = [prepare(c, Pipeline().cloud, np.random.default_rng(0)) for c in clouds]
+    errors = []
+    for k, (before, after) in enumerate(pairwise(scans)):
+        T = se3.inverse(before.T_world_sensor) @ after.T_world_sensor
+        rng = np.random.default_rng(k)
+        found = register(prepared[k + 1], prepared[k], T, icp, rng).T_ref_read
+        errors.append(np.linalg.norm(se3.log(se3.inverse(T) @ found)[:3]))
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def test_scans_with_their_motion_undone_register_as_well_as_frozen_ones() -> None:
+    drive, scanner = Drive(motion="spin", turn_rad_s=1.0), SCANNERS["os1_64"]
+    errors = []
+    for seed in (1, 2, 3):
+        swept = list(simulation := Simulation("office", seed, 7, scanner, drive=drive))
+        instants = replace(drive, sweeps=False)
+        frozen = list(Simulation("office", seed, 7, scanner, drive=instants))
+        track = simulation.true_track()
+        errors.append(
+            [
+                rms_error(swept, [deskew(s, track).points for s in swept]),
+                rms_error(frozen, [s.points for s in frozen]),
+                rms_error(swept, [s.points for s in swept]),
+            ]
+        )
+    undone, still, raw = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert undone < 1.3 * still
+    assert raw > 2.5 * still

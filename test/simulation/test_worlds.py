@@ -5,6 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 
+from cello3d_ros.geometry import se3
 from cello3d_ros.simulation.worlds import WORLDS, build_world
 
 # of micrometres, for seed 3: a change here is another recipe of every model trained before
@@ -44,6 +45,7 @@ def test_movers_keep_to_their_routes_and_reflectances_are_shares(name: str) -> N
     for mover in world.movers:
         T = mover.poses(np.array([0.0, 0.01, 3.0]))
         assert mover.route.distance(T[:, :2, 3]).max() < 0.6
+        assert all(se3.is_rigid(pose, 1e-9) for pose in T)
         assert np.linalg.norm(T[1, :3, 3] - T[0, :3, 3]) == pytest.approx(
             0.01 * abs(mover.speed_m_s), rel=0.05
         )
