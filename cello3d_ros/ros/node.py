@@ -168,8 +168,9 @@ class CovarianceNode(ManagedNode):
 
     def _on_cloud(self, message: PointCloud2, info: dict[str, Any]) -> None:
         self._came.add(Role.CLOUD)
-        self._statistics.receive(self._n_unheard(info))
-        self._worker.hear_cloud(message, self._now_ns())
+        n_unheard = self._n_unheard(info)
+        self._statistics.receive(n_unheard)
+        self._worker.hear_cloud(message, self._now_ns(), n_unheard)
         if self._worker.has_work:
             self._work_is_there.trigger()
 
@@ -204,7 +205,7 @@ class CovarianceNode(ManagedNode):
     # what is said
 
     def _work_when_quiet(self) -> None:
-        """Work, but first hear what came meanwhile: an older cloud must not win over the newest.
+        """Work; under overload first hear what came meanwhile: the newest cloud is next.
 
         A guard runs after the subscriptions, of which each hands over one message at a time: the
         newest cloud may be one turn away, and its odometry behind all that came before it.
@@ -212,7 +213,8 @@ class CovarianceNode(ManagedNode):
         came, self._came = self._came, set()
         is_waited_for = {Role.CLOUD} if self._worker.newest_is_ready else {Role.CLOUD, Role.POSE}
         now_s = time.monotonic()
-        if came & is_waited_for and now_s < (self._patient_until_s or math.inf):
+        is_patient = self._worker.is_overloaded and now_s < (self._patient_until_s or math.inf)
+        if came & is_waited_for and is_patient:
             self._patient_until_s = self._patient_until_s or now_s + _PATIENCE_S
             self._work_is_there.trigger()
             return

@@ -1,4 +1,4 @@
-"""From messages to answers, one cloud at a time: newest first, whatever is heard.
+"""From messages to answers, one cloud at a time, whatever is heard.
 
 Knows messages but no graph: its owner passes in messages and the time, publishes the answers and
 hears of every cloud that is dropped.
@@ -75,6 +75,11 @@ class Worker:
         return len(self._intake) > 0
 
     @property
+    def is_overloaded(self) -> bool:
+        """Whether clouds come faster than they can be worked on: then the newest is next."""
+        return self._intake.is_overloaded
+
+    @property
     def newest_is_ready(self) -> bool:
         """Whether the cloud that came last need not wait for its odometry."""
         return self._intake.newest_is_ready()
@@ -123,19 +128,23 @@ class Worker:
         self._locator.map_frame = frame_id
         self._tracker.take_map(stamp_ns, points, frame_id)
 
-    def hear_cloud(self, message: PointCloud2, now_ns: int) -> None:
-        """Let a cloud wait for its odometry, or drop it."""
+    def hear_cloud(self, message: PointCloud2, now_ns: int, n_unheard: int = 0) -> None:
+        """Let a cloud wait for its odometry, or drop it.
+
+        n_unheard: clouds that came before it and were overwritten before they were heard.
+        """
         received_s = time.monotonic()
         stamp_ns = messages.stamp_ns_of(message)
         points = self._admitted(stamp_ns, message, now_ns)
         if isinstance(points, Skip):
             self._skip(points)
             return
-        for skip in self._intake.offer(Job(stamp_ns, points, message.header.frame_id, received_s)):
+        job = Job(stamp_ns, points, message.header.frame_id, received_s)
+        for skip in self._intake.offer(job, n_unheard):
             self._skip(skip)
 
     def take(self) -> Job | None:
-        """Return the newest cloud whose odometry is there, if there is one."""
+        """Return the next cloud whose odometry is there, if there is one."""
         job, skips = self._intake.take()
         for skip in skips:
             self._skip(skip)
@@ -147,11 +156,15 @@ class Worker:
         Raises Cello3dError when there is no answer.
         """
         assert job.place is not None
+        self._began_s = time.monotonic()
         return self._tracker.step(job.stamp_ns, job.points, job.place)
 
     def finish(self) -> None:
         """Do what the next cloud would have to wait for, once the last one is answered."""
-        self._tracker.finish()
+        try:
+            self._tracker.finish()
+        finally:
+            self._intake.note_work(time.monotonic() - self._began_s)
 
     def expire(self, elapsed_s: float) -> None:
         """Drop the clouds that have waited too long for their odometry."""

@@ -1,7 +1,8 @@
-"""Which cloud is worked on next: order of stamps, waiting for odometry, newest wins.  No ROS."""
+"""Which cloud is worked on next: order of stamps, waiting for odometry, overload.  No ROS."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -14,7 +15,10 @@ JUMP_NS = (
     1_000_000_000  # a stamp that goes back by more than this is a clock set back, a bag looped
 )
 
-_N_SLOTS = 2
+_N_WAITING = 64  # clouds that wait
+_N_POINTS = 8_000_000  # points of all of them: 200 MB
+_N_CLOUDS = 10  # whose times of arrival say how often clouds come
+_N_WORKS = 2  # pieces of work in a row that are too long are no accident
 
 
 @dataclass(frozen=True)
@@ -51,11 +55,12 @@ def stamp_order(stamp_ns: int, newest_ns: int | None) -> str:
 
 
 class Intake:
-    """At most two clouds wait for their odometry: the oldest and the newest.
+    """Clouds that wait for their odometry, worked on in their order.
 
-    A cloud between them is dropped, so that nothing queues up; the oldest keeps its place, so
-    that odometry which is always late by more than a period of the clouds starves nobody.  Of
-    the clouds whose odometry is there the newest is taken and the others are dropped.
+    Only where the work takes longer than clouds take to come is the newest taken first and those
+    before it dropped.  A bounded number waits, with a bounded number of points; beyond that the
+    newest takes the place of the one before it, so that odometry that is always late starves
+    nobody.
     """
 
     def __init__(
@@ -69,21 +74,45 @@ class Intake:
         self._what = what
         self.timeout_s = timeout_s
         self._waiting: list[Job] = []
+        self._came_s: deque[float] = deque(maxlen=_N_CLOUDS)
+        self._worked_s: deque[float] = deque(maxlen=_N_WORKS)
 
     def __len__(self) -> int:
         return len(self._waiting)
+
+    @property
+    def is_overloaded(self) -> bool:
+        """Whether the last pieces of work each took longer than a cloud takes to come."""
+        if len(self._worked_s) < _N_WORKS or len(self._came_s) < 2:
+            return False
+        period_s = (self._came_s[-1] - self._came_s[0]) / (len(self._came_s) - 1)
+        return min(self._worked_s) > period_s
+
+    def note_work(self, seconds: float) -> None:
+        """Note how long the work on a cloud took."""
+        self._worked_s.append(seconds)
 
     def clear(self, reason: str, sentence: str) -> list[Skip]:
         """Forget the clouds that wait, for a reason."""
         dropped = [Skip(job.stamp_ns, reason, sentence) for job in self._waiting]
         self._waiting.clear()
+        self._came_s.clear()
         return dropped
 
-    def offer(self, job: Job) -> list[Skip]:
-        """Let a cloud wait, later than all that wait; return what it displaced."""
-        displaced = self._waiting[_N_SLOTS - 1 :]
-        self._waiting[_N_SLOTS - 1 :] = [job]
-        return [_superseded(old) for old in displaced]
+    def offer(self, job: Job, n_unheard: int = 0) -> list[Skip]:
+        """Let a cloud wait, later than all that wait; return what it displaced.
+
+        n_unheard: clouds that came before it but never got here.
+        """
+        self._came_s.extend([job.received_s] * (1 + n_unheard))
+        displaced = []
+        n_points = len(job.points) + sum(len(old.points) for old in self._waiting)
+        while self._waiting and (len(self._waiting) >= _N_WAITING or n_points > _N_POINTS):
+            displaced.append(self._waiting.pop())
+            n_points -= len(displaced[-1].points)
+        self._waiting.append(job)
+        sentence = f"{len(self._waiting)} clouds wait for {self._what}: no more are kept"
+        return [Skip(old.stamp_ns, "superseded", sentence) for old in reversed(displaced)]
 
     def newest_is_ready(self) -> bool:
         """Return whether no cloud waits or the newest has all, or can have nothing more."""
@@ -95,20 +124,24 @@ class Intake:
         return True
 
     def take(self) -> tuple[Job | None, list[Skip]]:
-        """Return the newest cloud whose odometry is there, if any, and what was dropped."""
-        skips = []
-        for i in reversed(range(len(self._waiting))):
-            job = self._waiting[i]
+        """Return the next cloud whose odometry is there, if any, and what was dropped.
+
+        It is the oldest such cloud, or the newest under overload; what is older is dropped.
+        """
+        skips: list[Skip] = []
+        is_overloaded = self.is_overloaded
+        for job in self._waiting[::-1] if is_overloaded else self._waiting[:]:
             try:
                 job.place = self._place(job)
             except PoseNotYetError:
                 continue
             except PoseError as error:
                 skips.append(self._without_place(job, error))
-                del self._waiting[i]
+                self._waiting.remove(job)
                 continue
-            skips += [_superseded(old) for old in self._waiting[:i]]
-            del self._waiting[: i + 1]
+            k = self._waiting.index(job)
+            skips += [self._passed_over(old, is_overloaded) for old in self._waiting[:k]]
+            del self._waiting[: k + 1]
             return job, skips
         return None, skips
 
@@ -135,13 +168,18 @@ class Intake:
     def _place(self, job: Job) -> Place:
         return self._locate(job.stamp_ns, job.frame_id, job.waited_s >= self.timeout_s)
 
+    def _passed_over(self, job: Job, is_overloaded: bool) -> Skip:
+        if not is_overloaded:  # a later cloud has what this one lacks
+            try:
+                self._place(job)
+            except PoseError as error:
+                return self._without_place(job, error)
+        sentence = "the work takes longer than clouds take to come, and a newer one was there"
+        return Skip(job.stamp_ns, "superseded", sentence)
+
     def _without_place(self, job: Job, error: PoseError) -> Skip:
         if isinstance(error, UnknownFrameError):
             return Skip(job.stamp_ns, "unknown_frame", str(error))
         reason = f"no_{self._what.replace(' ', '_')}"
         sentence = f"no {self._what} at the stamp of the cloud: {error}"
         return Skip(job.stamp_ns, reason, sentence)
-
-
-def _superseded(job: Job) -> Skip:
-    return Skip(job.stamp_ns, "superseded", "a newer cloud came before it could be worked on")

@@ -70,9 +70,10 @@ def test_parameters_that_change_under_load(robot, change, ask) -> None:
 
 def test_the_newest_cloud_is_next_when_many_came_during_long_work(robot, change) -> None:
     """Each with its odometry, which waits in a queue of its own."""
-    player, before = robot.player, robot.walk()
+    player = robot.player
     assert change("node.covariance_mode", "fused").successful
     assert change("node.n_registrations", 60).successful
+    before = robot.walk(2)
     clouds, poses = [], []
     for _ in range(30):
         robot.step()

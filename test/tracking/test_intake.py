@@ -1,4 +1,4 @@
-"""Order of clouds, waiting for odometry, newest wins."""
+"""Order of clouds, waiting for odometry, overload."""
 
 import numpy as np
 import pytest
@@ -13,8 +13,11 @@ from cello3d_ros.tracking.odometry import PoseSource
 S = 1_000_000_000
 
 
-def job(stamp_ns: int) -> Job:
-    return Job(stamp_ns, np.empty((0, 3)), "lidar", received_s=0.0)
+NOTHING = np.empty((0, 3))
+
+
+def job(stamp_ns: int, points: np.ndarray = NOTHING, received_s: float = 0.0) -> Job:
+    return Job(stamp_ns, points, "lidar", received_s)
 
 
 def odometry(*stamps: int) -> PoseTrack:
@@ -58,14 +61,76 @@ def test_a_cloud_waits_for_its_odometry_and_then_comes_out_with_it() -> None:
     assert (skips, len(intake)) == ([], 0)
 
 
-def test_the_newest_cloud_wins_and_the_older_is_counted() -> None:
+def test_clouds_are_taken_in_order_while_the_work_is_fast() -> None:
     intake = intake_of(odometry(S, 2 * S, 3 * S))
-    intake.offer(job(S))
-    intake.offer(job(2 * S))
+    for k in (1, 2, 3):
+        intake.offer(job(k * S, received_s=0.1 * k))
+        intake.note_work(0.02)
+    taken = [intake.take() for _ in range(3)]
+    assert [(job.stamp_ns // S, skips) for job, skips in taken] == [(1, []), (2, []), (3, [])]
+
+
+def test_under_overload_the_newest_cloud_wins_and_the_older_is_counted() -> None:
+    intake = intake_of(odometry(S, 2 * S, 3 * S))
+    for k in (1, 2):
+        intake.offer(job(k * S, received_s=0.1 * k))
+        intake.note_work(0.3)
     taken, skips = intake.take()
     assert taken is not None
     assert taken.stamp_ns == 2 * S
     assert [(skip.stamp_ns, skip.reason) for skip in skips] == [(S, "superseded")]
+
+
+def test_clouds_that_were_never_heard_count_for_the_load() -> None:
+    intake = intake_of(odometry(S, 2 * S, 3 * S))
+    for k in (1, 2):
+        intake.offer(job(k * S, received_s=0.5 * k), n_unheard=4)
+        intake.note_work(0.3)
+    assert intake.is_overloaded  # two heard in half a second, but ten came
+
+
+def test_one_long_piece_of_work_is_no_overload() -> None:
+    intake = intake_of(odometry(S, 2 * S, 3 * S))
+    intake.note_work(0.02)
+    for k in (1, 2):
+        intake.offer(job(k * S, received_s=0.1 * k))
+    intake.note_work(5.0)
+    assert not intake.is_overloaded
+    assert intake.take()[0].stamp_ns == S
+
+
+@pytest.mark.parametrize(
+    ("lidar_hz", "odometry_hz", "late_s"),
+    [
+        (10, 5, 0.0),
+        (20, 10, 0.0),
+        (20, 50, 0.15),
+        (10, 20, 0.3),
+        (20, 2, 0.0),
+        (10, 10, 0.45),
+    ],
+)
+def test_all_are_answered_whatever_the_rate_and_delay_of_odometry(
+    lidar_hz, odometry_hz, late_s
+) -> None:
+    """In the order of events, as a node with work of 20 ms hears them."""
+    buffer = odometry()
+    intake, answered = intake_of(buffer), []
+    clouds = [(k / lidar_hz, "cloud", k * S // lidar_hz) for k in range(4 * lidar_hz)]
+    poses = [
+        (k / odometry_hz + late_s, "pose", k * S // odometry_hz)
+        for k in range(4 * odometry_hz + 2)
+    ]
+    for at_s, kind, stamp_ns in sorted(clouds + poses):
+        if kind == "pose":
+            buffer.add(stamp_ns, np.eye(4))
+        else:
+            assert intake.offer(job(stamp_ns, received_s=at_s)) == []
+        while (found := intake.take())[0] is not None:
+            answered.append(found[0].stamp_ns)
+            assert found[1] == []
+            intake.note_work(0.02)
+    assert answered == [stamp_ns for _, _, stamp_ns in clouds]
 
 
 def test_a_newer_cloud_without_odometry_does_not_hold_up_the_older() -> None:
@@ -89,15 +154,25 @@ def test_odometry_late_by_many_periods_starves_nobody() -> None:
         taken, _ = intake.take()
         if taken is not None:
             answered.append(taken.stamp_ns)
-    assert len(answered) >= 6
+    assert len(answered) == 34
     assert answered == sorted(answered)
 
 
-def test_never_more_than_two_wait_and_every_displaced_cloud_is_counted() -> None:
+def test_a_bounded_number_waits_and_every_displaced_cloud_is_counted() -> None:
     intake = intake_of(odometry())
-    skips = [skip for i in range(10) for skip in intake.offer(job(i * S))]
+    skips = [skip for i in range(100) for skip in intake.offer(job(i * S))]
+    assert len(intake) == 64
+    assert [skip.stamp_ns // S for skip in skips] == list(range(63, 99))
+    assert {skip.reason for skip in skips} == {"superseded"}
+    assert "64 clouds wait for odometry" in skips[0].sentence
+
+
+def test_a_bounded_number_of_points_waits() -> None:
+    intake = intake_of(odometry())
+    many = np.broadcast_to(np.zeros(3), (3_000_000, 3))
+    skips = [skip for i in range(5) for skip in intake.offer(job(i * S, many))]
     assert len(intake) == 2
-    assert [skip.stamp_ns // S for skip in skips] == list(range(1, 9))
+    assert [skip.stamp_ns // S for skip in skips] == [1, 2, 3]
 
 
 def test_a_cloud_older_than_all_odometry_is_skipped_at_once() -> None:
