@@ -201,6 +201,9 @@ class InputConfig(Section):
     odometry_timeout_s: float = _setting(0.5, "wait for odometry after a cloud's stamp", 0.0, 60.0)
     odometry_gap_s: float = _setting(1.0, "odometry farther apart is not interpolated", 0.0)
     odometry_buffer_s: float = _setting(10.0, "odometry remembered", 0.1, 3600.0)
+    cloud_time_offset_s: float = _setting(
+        0.0, "added to the stamps of clouds: a constant delay, or a clock of PTP or since boot"
+    )
     future_tolerance_s: float = _setting(0.5, "a cloud stamped later than now + this", 0.0)
 
 
@@ -226,6 +229,19 @@ class PairingConfig(Section):
     )
     max_external_offset: float = _setting(
         0.5, "an external pose that ICP would move farther (m, rad) is refused; 0 is no look", 0.0
+    )
+    max_odometry_deviation_m: float = _setting(
+        1.0,
+        "a registration farther from its odometry is refused, "
+        "unless odometry tells a covariance; 0 is no look",
+        0.0,
+    )
+    max_odometry_deviation_rad: float = _setting(0.5, "the same for rotations", 0.0)
+    publish_disagreeing: bool = _setting(
+        False, "publish what disagrees with odometry, with a warning, instead of refusing it"
+    )
+    planar: bool = _setting(
+        False, "z, roll and pitch of the base by odometry alone: for robots that stay on a floor"
     )
     max_pair_gap_s: float = _setting(10.0, "scans farther apart are not paired", 0.0)
     max_failures: int = _setting(3, "failed pairs before the reference is given up", 1)
@@ -269,7 +285,7 @@ class OutputConfig(Section):
     warn_sigma_m: float = _setting(0.3, "3 sigma along the weakest axis that warns", 0.0)
     error_sigma_m: float = _setting(1.0, "3 sigma along the weakest axis that is an error", 0.0)
     floor_sigma_m: float = _setting(1e-4, "smallest published standard deviation", 1e-9)
-    floor_sigma_rad: float = _setting(1e-5, "smallest published standard deviation", 1e-9)
+    floor_sigma_rad: float = _setting(1e-4, "smallest published standard deviation", 1e-9)
     ceiling: float = _setting(900.0, "largest published eigenvalue (m^2, rad^2)", 1e-6, 1e3)
     marker_scale: float = _setting(1.0, "~/markers are drawn this many times as large", 1e-3, 1e6)
     marker_lifetime_s: float = _setting(10.0, "~/markers vanish after this; 0 is never", 0.0)
@@ -299,6 +315,11 @@ class NodeConfig(OutputConfig, CovarianceConfig, PairingConfig, InputConfig):
                     f"NodeConfig.{name} must be below the root of NodeConfig.ceiling, "
                     f"{math.sqrt(self.ceiling):g}: {floor}"
                 )
+        if self.use_tf and self.publish_tf and self.output_frame == "sensor":
+            raise ConfigError(
+                "NodeConfig.publish_tf with NodeConfig.use_tf would give the sensor a second "
+                "parent and cut it from the base: set NodeConfig.output_frame to base"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

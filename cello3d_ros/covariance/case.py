@@ -33,7 +33,7 @@ class MethodSettings(NamedTuple):
     widen_unknown: bool = True
     scale: float = 1.0
     floor_sigma_m: float = 1e-4
-    floor_sigma_rad: float = 1e-5
+    floor_sigma_rad: float = 1e-4
     ceiling: float = 900.0
     n_threads: int = min(os.cpu_count() or 1, 4)  # more than that is not worth starting
 

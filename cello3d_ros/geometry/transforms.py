@@ -32,6 +32,8 @@ _N_NAMED = 20  # frames that an error names
 class UnknownFrameError(PoseNotYetError):
     """No transform leads from one frame to another at a stamp; it may still come."""
 
+    reason = "unknown_frame"
+
 
 class NotConnectedError(UnknownFrameError):
     """No transforms connect two frames, at any time."""
@@ -81,6 +83,14 @@ class TransformTree:
                 ) from None
             T = T @ (step if forward else se3.inverse(step))
         return T
+
+    def leads_through(self, parent: str, child: str, frame: str) -> bool:
+        """Return whether a third frame lies on the way from one frame to another."""
+        try:
+            steps = self._way(parent, child)
+        except NotConnectedError:
+            return False
+        return frame.strip("/") in {end for edge, _ in steps for end in edge}
 
     def constant(self, parent: str, child: str) -> Array | None:
         """Return T_parent_child (4, 4) where it is the same at all times, else None.

@@ -59,6 +59,14 @@ def register(
     return BACKENDS[config.backend](reading, reference, T_init, config, rng)
 
 
+def check_installed(config: IcpConfig) -> None:
+    """Raise ConfigError, which says how to get it, where the backend's library is missing."""
+    if config.backend == "small_gicp":
+        _imported("small_gicp", "small_gicp", "small_gicp", config)
+    elif config.backend != "icp":
+        _imported("open3d", "Open3D", "open3d", config)
+
+
 def register_many(
     reading: Cloud,
     reference: Cloud,

@@ -31,8 +31,20 @@ class Verdict(NamedTuple):
     sentence: str
 
 
-def judged(C: Array, found: Estimate, config: NodeConfig) -> Verdict:
-    """Judge an answer by its covariance (6, 6), as published, and by what the model says of it."""
+class State(NamedTuple):
+    """What a node says of itself beside its clouds: restarts of the chain, jumps, warnings."""
+
+    n_restarts: int
+    last_restart: str
+    n_clock_jumps: int
+    warnings: tuple[str, ...] = ()
+
+
+def judged(C: Array, found: Estimate, config: NodeConfig, disagreement: str = "") -> Verdict:
+    """Judge an answer by its covariance (6, 6), as published, the model and the odometry.
+
+    disagreement: why odometry contradicts it, or "".
+    """
     longest_m = N_SIGMA * float(principal_axes(C[:3, :3])[0][0])
     level, reasons = OK, []
     for worse, name in ((WARN, "warn_sigma_m"), (ERROR, "error_sigma_m")):
@@ -42,6 +54,9 @@ def judged(C: Array, found: Estimate, config: NodeConfig) -> Verdict:
     if found.is_lost:
         level = max(level, WARN)
         reasons.append("probably lost: the scans fit badly, and the pose may be off by a metre")
+    if disagreement:
+        level = max(level, WARN)
+        reasons.append(disagreement)
     if found.is_unknown:
         level = max(level, WARN)
         reasons.append("out of distribution: the model has seen no pair like this one")
@@ -64,6 +79,11 @@ class Statistics:
         self._n_failed_in_a_row = 0
         self._verdict = Verdict(OK, "answered")
         self._answer: dict[str, str] = {}
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether the node listens and no cloud has met its fate yet."""
+        return self._last_event == WAITING
 
     def listen(self, is_listening: bool) -> None:
         """Note that the node has begun, or ceased, to listen."""
@@ -102,17 +122,12 @@ class Statistics:
         self._ages_s.append(1e-9 * (now_ns - answer.stamp_ns))
         self._answer = _described(answer, C)
 
-    def message(
-        self,
-        name: str,
-        now_ns: int,
-        config: NodeConfig,
-        n_restarts: int,
-        last_restart: str,
-        n_clock_jumps: int,
-    ) -> DiagnosticArray:
+    def message(self, name: str, now_ns: int, config: NodeConfig, state: State) -> DiagnosticArray:
         """Return the message of now: level, one sentence, keys and values."""
         verdict = self._judged(config.max_failures)
+        if state.warnings:
+            said = [] if verdict.level == OK else [verdict.sentence]
+            verdict = Verdict(max(verdict.level, WARN), "; ".join([*said, *state.warnings]))
         status = DiagnosticStatus(
             name=name, level=_LEVELS[verdict.level], message=verdict.sentence
         )
@@ -127,9 +142,10 @@ class Statistics:
             **{f"dropped.{reason}": str(n) for reason, n in sorted(self.dropped.items())},
             "odometry_received": str(self.counts["odometry"]),
             "odometry_rejected": str(self.counts["odometry_rejected"]),
-            "clock_jumps": str(n_clock_jumps),
-            "chain_restarts": str(n_restarts),
-            "last_restart": last_restart,
+            "clock_jumps": str(state.n_clock_jumps),
+            "chain_restarts": str(state.n_restarts),
+            "last_restart": state.last_restart,
+            "warnings": "; ".join(state.warnings),
             "model": self._model_name,
             "covariance_mode": config.covariance_mode,
             "rate_hz.received": f"{_rate_hz(self._received_s):.2f}",
@@ -148,7 +164,8 @@ class Statistics:
             is_serious = self._n_failed_in_a_row >= n_serious_failures
             return Verdict(ERROR if is_serious else WARN, f"no answer: {self._last_failure}")
         if self._last_event == WAITING:
-            return Verdict(WARN, "waiting for clouds and odometry")
+            has_odometry = self.counts["odometry"] > self.counts["odometry_rejected"]
+            return Verdict(WARN, f"waiting for clouds{'' if has_odometry else ' and odometry'}")
         if self._last_event == INACTIVE:
             return Verdict(OK, "inactive: not listening")
         if self._last_event == REFERENCE:

@@ -36,14 +36,18 @@ class Topic(NamedTuple):
 def topics(config: NodeConfig) -> list[Topic]:
     """Return all subscriptions, clouds last: who hears clouds hears the rest as well.
 
-    Reference clouds are heard twice over: latched ones from before the node began, and those of
-    publishers that do not latch.  Raises ConfigError when a type of message is not installed.
+    Static transforms and reference clouds are heard twice over: latched ones from before the node
+    began, and those of publishers that do not latch.  Raises ConfigError when a type of message is
+    not installed.
     """
     found = []
     if config.use_tf:
         kind = tf_message("node.use_tf")
         found += [
-            Topic(Role.STATIC_TRANSFORMS, kind, "/tf_static", _latched(100)),
+            *(
+                Topic(Role.STATIC_TRANSFORMS, kind, "/tf_static", qos)
+                for qos in (_latched(100), QoSProfile(depth=100))
+            ),
             Topic(Role.TRANSFORMS, kind, "/tf", QoSProfile(depth=100)),
         ]
     if config.pairing == "topics":
@@ -58,7 +62,7 @@ def topics(config: NodeConfig) -> list[Topic]:
         ]
     else:
         found.append(Topic(Role.POSE, Odometry, "odom", _best_effort(200)))
-    return [*found, Topic(Role.CLOUD, PointCloud2, "points", _best_effort(2))]
+    return [*found, Topic(Role.CLOUD, PointCloud2, "points", _best_effort(5))]
 
 
 def _best_effort(depth: int) -> QoSProfile:

@@ -17,6 +17,13 @@ class Logbook:
     def __init__(self, log: Callable[[str], object]) -> None:
         self._log = log
         self._warned_s: dict[str, float] = {}
+        self._told: set[str] = set()
+
+    def warn_once(self, sentence: str) -> None:
+        """Log a sentence, unless its like has ever been logged."""
+        if (key := re.sub(r"[0-9.]+", "", sentence)) not in self._told:
+            self._told.add(key)
+            self._log(sentence)
 
     def warn(self, kind: str, sentence: str) -> None:
         """Log a sentence of some kind, unless its like was logged a moment ago."""

@@ -13,7 +13,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from cello3d_ros.errors import ConfigError, CovarianceError
 from cello3d_ros.geometry import se3
-from cello3d_ros.geometry.gaussian import to_fixed_axes
+from cello3d_ros.geometry.gaussian import is_positive_definite, to_fixed_axes
 from cello3d_ros.geometry.pose_track import checked_pose
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.tracking.covariances import ros_covariance as ros_covariance
@@ -40,6 +40,17 @@ def duration_of(seconds: float) -> Duration:
 def pose_from(pose: Pose) -> Array:
     """Return a geometry_msgs/Pose as a (4, 4) matrix.  Raises PoseError when damaged."""
     return checked_pose(pose.position, pose.orientation)
+
+
+def covariance_from(message: Any) -> Array | None:
+    """Return the right covariance (6, 6) of a message with a pose, or None where it has none.
+
+    It has none where it is not positive definite: drivers leave it at zero, or mark it with -1.
+    """
+    C = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+    if not is_positive_definite(C):
+        return None
+    return reading_covariance(C, pose_from(message.pose.pose)[:3, :3])
 
 
 def pose_to(T: Array) -> Pose:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -35,18 +35,20 @@ from cello3d_ros.config import PIPELINE, Config, differences
 from cello3d_ros.covariance.model import Model, find_model, load_model
 from cello3d_ros.errors import Cello3dError, ConfigError
 from cello3d_ros.ros import parameters
-from cello3d_ros.ros.diagnostics import Statistics
+from cello3d_ros.ros.diagnostics import State, Statistics
 from cello3d_ros.ros.inputs import Role, Topic, topics
 from cello3d_ros.ros.life import ManagedNode
 from cello3d_ros.ros.logbook import Logbook
 from cello3d_ros.ros.messages import tf_message
 from cello3d_ros.ros.outputs import Outputs
+from cello3d_ros.ros.process import PROFILE
 from cello3d_ros.ros.worker import Worker
 from cello3d_ros.tracking.intake import JUMP_NS, Job, Skip
 from cello3d_ros.tracking.tracker import Answer
 from cello3d_ros.tracking.warmup import warm_up
 
 _PATIENCE_S = 0.05  # longest time for which work is put off to hear what came before it
+_N_LOOKS = 4  # seconds for which a publisher of clouds may be silent
 _TICK_S = 0.05  # how often it is looked whether a cloud has waited too long
 
 
@@ -59,6 +61,7 @@ class CovarianceNode(ManagedNode):
         parameters.declare_first(self)
         self._config: Config | None = None  # None: not configured
         self._defaults: Config | None = None
+        self._n_publishers = self._n_looks_in_vain = 0
         self._logbook = Logbook(lambda sentence: self.get_logger().warning(sentence))
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.add_on_set_parameters_callback(self._check_parameters)
@@ -80,13 +83,14 @@ class CovarianceNode(ManagedNode):
         self.get_logger().info("warming up; a first start compiles the kernels")
         warm_up(self._model, config)
         self._statistics = Statistics(path.name)
-        self._worker = Worker(self._model, config, self._skip, self._logbook.warn)
+        is_given = parameters.T_BASE_SENSOR in parameters.overrides(self)
+        self._worker = Worker(self._model, config, self._skip, self._logbook.warn, is_given)
         self.configured.callback(self._forget)
         self._outputs = Outputs(self, config.node)
         self.configured.callback(self._outputs.destroy)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.configured.callback(self.destroy_publisher, self._diagnostics)
-        timer = self.create_timer(1.0, self._publish_diagnostics, clock=self._steady)
+        timer = self.create_timer(1.0, self._look_about, clock=self._steady)
         self.configured.callback(self.destroy_timer, timer)
         reset = self.create_service(Trigger, "~/reset", self._reset)
         self.configured.callback(self.destroy_service, reset)
@@ -102,6 +106,8 @@ class CovarianceNode(ManagedNode):
         self._came: set[Role] = set()
         self._patient_until_s: float | None = None
         self._last_cloud: tuple[Any, int | None] = None, None  # its publisher and number
+        self._n_publishers = 0  # of clouds, when the last one came
+        self._n_looks_in_vain = 0  # at publishers from which no cloud comes
         self._work_is_there = self.create_guard_condition(self._work_when_quiet)
         self.active.callback(self.destroy_guard_condition, self._work_is_there)
         timer = self.create_timer(_TICK_S, self._expire, clock=self._steady)
@@ -181,6 +187,7 @@ class CovarianceNode(ManagedNode):
         and the same as before.
         """
         publishers = self.get_publishers_info_by_topic(self.resolve_topic_name("points"))
+        self._n_publishers = len(publishers)
         only = tuple(publishers[0].endpoint_gid) if len(publishers) == 1 else None
         number = info.get("publication_sequence_number")
         (publisher, before), self._last_cloud = self._last_cloud, (only, number)
@@ -266,14 +273,43 @@ class CovarianceNode(ManagedNode):
         assert self._config is not None
         self._diagnostics.publish(
             self._statistics.message(
-                f"{self.get_name()}: registration",
+                f"{self.get_fully_qualified_name().strip('/')}: registration",
                 self._now_ns(),
                 self._config.node,
-                self._worker.n_restarts,
-                self._worker.last_restart,
-                self._worker.n_clock_jumps,
+                self._state(),
             )
         )
+
+    def _state(self) -> State:
+        worker = self._worker
+        warnings = [*worker.warnings, *self._publisher_warnings()]
+        for sentence in warnings:
+            self._logbook.warn_once(sentence)
+        return State(worker.n_restarts, worker.last_restart, worker.n_clock_jumps, tuple(warnings))
+
+    def _publisher_warnings(self) -> Iterator[str]:
+        topic = self.resolve_topic_name("points")
+        if self._n_publishers > 1:
+            yield (
+                f"{self._n_publishers} publishers send clouds on {topic}: if they are lidars, "
+                "merge their clouds or start a node for each"
+            )
+        if self._n_looks_in_vain >= _N_LOOKS:
+            yield (
+                f"{topic} has a publisher but no cloud arrives: large clouds need the DDS profile "
+                f"config/{PROFILE} of this package (FASTRTPS_DEFAULT_PROFILES_FILE) in both "
+                "programs"
+            )
+
+    def _look_about(self) -> None:
+        """Once a second: is there a publisher of clouds from which none has ever come?"""
+        is_in_vain = (
+            self._statistics.is_waiting
+            and self._statistics.counts["received"] == 0
+            and self.count_publishers(self.resolve_topic_name("points")) > 0
+        )
+        self._n_looks_in_vain = self._n_looks_in_vain + 1 if is_in_vain else 0
+        self._publish_diagnostics()
 
     def _now_ns(self) -> int:
         return int(self.get_clock().now().nanoseconds)
@@ -284,6 +320,8 @@ class CovarianceNode(ManagedNode):
         try:
             if self._config is not None:
                 parameters.changed(self._config, given)
+            else:
+                parameters.check(self, given)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -50,7 +50,7 @@ class Outputs:
         pose = _pose(job.stamp_ns, answer.pose_frame_id, answer.pose, config)
         odometry = messages.full_odometry(pose, answer.child_frame_id, *_twist(answer, config))
         C: Array = relative.pose.covariance.reshape(6, 6)
-        verdict = judged(C, answer.estimate, config)
+        verdict = judged(C, answer.estimate, config, answer.disagreement)
         self._odometry.publish(odometry)
         self._relative.publish(relative)
         self._pose.publish(pose)

@@ -12,31 +12,35 @@ from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from cello3d_ros.config import SECTIONS, Config
+from cello3d_ros.config import PIPELINE, SECTIONS, Config, IcpConfig
 from cello3d_ros.errors import ConfigError
+from cello3d_ros.registration.backends import check_installed
 
 MODEL, AUTOSTART = "node.model", "node.autostart"
+T_BASE_SENSOR = "node.T_base_sensor"
 
-_FIXED = {"cloud", "grid", "sampling", "training"}  # sections read once, by configure
+_SECTIONS = {name: SECTIONS[name] for name in (*PIPELINE, "node")}  # others are the tools'
+_FIXED = {"cloud", "grid"}  # sections read once, by configure
 _FIXED_SETTINGS = {
     *(MODEL, AUTOSTART),
-    *("node.T_base_sensor", "node.odometry_buffer_s", "node.seed"),
+    *(T_BASE_SENSOR, "node.odometry_buffer_s", "node.seed"),
     *("node.pairing", "node.registration", "node.use_tf", "node.publish_tf"),
 }
+_ELSEWHERE = {"sampling", "training", "qos_overrides"}  # read by the tools, and by ROS
 _INT64 = 2**63 - 1
 
 
 def declare_first(node: Node) -> None:
     """Declare what is needed to configure: the defaults of the others come from the model."""
-    for field in dataclasses.fields(SECTIONS["node"]):
+    for field in dataclasses.fields(_SECTIONS["node"]):
         if (name := f"node.{field.name}") in (MODEL, AUTOSTART):
             _declare(node, name, field, field.default)
 
 
 def release(node: Node, defaults: Config) -> None:
     """Undeclare the settings still at their defaults: the next model brings its own."""
-    for section in SECTIONS:
-        for field in dataclasses.fields(SECTIONS[section]):
+    for section in _SECTIONS:
+        for field in dataclasses.fields(_SECTIONS[section]):
             name, value = (
                 f"{section}.{field.name}",
                 getattr(getattr(defaults, section), field.name),
@@ -55,16 +59,16 @@ def declare(node: Node, defaults: Config) -> Config:
     """
     given = overrides(node)
     values: dict[str, Any] = {}
-    for section in SECTIONS:
+    for section in _SECTIONS:
         _built(section, _of(section, given))
-        for field in dataclasses.fields(SECTIONS[section]):
+        for field in dataclasses.fields(_SECTIONS[section]):
             name = f"{section}.{field.name}"
             default = getattr(getattr(defaults, section), field.name)
             if node.has_parameter(name):
                 values[name] = node.get_parameter(name).value
             else:
                 values[name] = _declare(node, name, field, default)
-    return _config(values)
+    return _config(defaults, values)
 
 
 def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
@@ -80,7 +84,17 @@ def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
                 "clean the node up, set it and configure again"
             )
     new = {parameter.name: parameter.value for parameter in parameters}
-    return _config({name: new.get(name, value) for name, value in _values(config).items()})
+    return _config(config, {name: new.get(name, v) for name, v in _values(config).items()})
+
+
+def check(node: Node, given: Iterable[Parameter]) -> None:
+    """Raise ConfigError for a parameter of a node that is not configured and can never be good."""
+    new = {parameter.name: parameter.value for parameter in given}
+    for section in _SECTIONS:
+        fields = (f"{section}.{field.name}" for field in dataclasses.fields(_SECTIONS[section]))
+        old = {name: node.get_parameter(name).value for name in fields if node.has_parameter(name)}
+        if old or _of(section, new):
+            _built(section, _of(section, {**old, **new}))
 
 
 def overrides(node: Node) -> dict[str, Any]:
@@ -93,7 +107,7 @@ def unknown(node: Node) -> list[str]:
     return sorted(
         name
         for name in overrides(node)
-        if not node.has_parameter(name) and not name.startswith("qos_overrides.")
+        if not node.has_parameter(name) and name.split(".")[0] not in _ELSEWHERE
     )
 
 
@@ -134,7 +148,7 @@ def _kind(default: Any) -> str:
 
 def _of(section: str, values: dict[str, Any]) -> dict[str, Any]:
     """Return the values whose names are settings of one section, by their short names."""
-    known = {field.name for field in dataclasses.fields(SECTIONS[section])}
+    known = {field.name for field in dataclasses.fields(_SECTIONS[section])}
     return {name: values[f"{section}.{name}"] for name in known if f"{section}.{name}" in values}
 
 
@@ -142,20 +156,25 @@ def _values(config: Config) -> dict[str, Any]:
     """Return every setting by its name as a parameter."""
     return {
         f"{section}.{field.name}": getattr(getattr(config, section), field.name)
-        for section in SECTIONS
-        for field in dataclasses.fields(SECTIONS[section])
+        for section in _SECTIONS
+        for field in dataclasses.fields(_SECTIONS[section])
     }
 
 
-def _config(values: dict[str, Any]) -> Config:
-    return Config(**{section: _built(section, _of(section, values)) for section in SECTIONS})
+def _config(others: Config, values: dict[str, Any]) -> Config:
+    """Return the settings of the values; those that are no parameters come from another."""
+    built = {section: _built(section, _of(section, values)) for section in _SECTIONS}
+    return dataclasses.replace(others, **built)
 
 
 def _built(section: str, values: dict[str, Any]) -> Any:
     """Build a section; ConfigError speaks of parameters as they are called in ROS."""
-    kind = SECTIONS[section]
+    kind = _SECTIONS[section]
     try:
-        return kind(**{name: _plain(value) for name, value in values.items()})
+        built = kind(**{name: _plain(value) for name, value in values.items()})
+        if isinstance(built, IcpConfig):
+            check_installed(built)
+        return built
     except ConfigError as error:
         text = str(error).replace(f"{kind.__name__}.", f"parameter {section}.")
         raise ConfigError(text) from None

@@ -102,7 +102,7 @@ class Player:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._check = check
-        self._status_name = f"{target.rsplit('/', 1)[-1]}: "
+        self._status_name = f"{target.strip('/')}: "
         self.replay = Replay()
         # the target hears of the publishers in this order: who hears odometry also hears clouds
         self.clouds = self._node.create_publisher(PointCloud2, "/points", 5)

@@ -44,7 +44,9 @@ class Worker:
         config: Config,
         skip: Callable[[Skip], None],
         warn: Callable[[str, str], None],
+        extrinsic_is_given: bool = False,
     ) -> None:
+        """extrinsic_is_given: as in Locator."""
         node = config.node
         self.config = config
         self.n_clock_jumps = 0
@@ -54,7 +56,7 @@ class Worker:
         self._poses = PoseTrack(gap_s, length_s, 100_000, what)
         self._source = PoseSource(self._poses)
         self._transforms = TransformTree(gap_s, length_s) if node.use_tf else None
-        self._locator = Locator(node, self._source, self._transforms)
+        self._locator = Locator(node, self._source, self._transforms, extrinsic_is_given)
         self._intake = Intake(self._locator.place, node.odometry_timeout_s, what)
         self._newest_cloud_ns: int | None = None
         self._tracker = Tracker(model, config, node)
@@ -68,6 +70,12 @@ class Worker:
     def last_restart(self) -> str:
         """Why the last one was given up."""
         return self._tracker.last_restart
+
+    @property
+    def warnings(self) -> list[str]:
+        """What seems wrong with the clouds or the odometry altogether, in sentences."""
+        found = self._locator.warning, self._tracker.warning, self._source.rejection
+        return [sentence for sentence in found if sentence]
 
     @property
     def has_work(self) -> bool:
@@ -101,10 +109,13 @@ class Worker:
             if stamp_order(stamp_ns, self._poses.newest_ns) == "jump":
                 self.jump_to(stamp_ns)
             frames = message.header.frame_id, getattr(message, "child_frame_id", "")
-            fastest = self.config.node.max_odometry_speed_m_s
-            if broken := self._source.hear(stamp_ns, T, *frames, fastest):
+            node = self.config.node
+            fastest = node.max_odometry_speed_m_s
+            Y = None if node.registration == "external" else messages.covariance_from(message)
+            if broken := self._source.hear(stamp_ns, T, *frames, fastest, Y):
                 self._warn("broken_chain", f"{broken}: the chain starts again")
         except PoseError as error:
+            self._source.reject(str(error))
             self._warn("odometry", f"{what} message rejected: {error}")
             return False
         return True
@@ -134,7 +145,8 @@ class Worker:
         n_unheard: clouds that came before it and were overwritten before they were heard.
         """
         received_s = time.monotonic()
-        stamp_ns = messages.stamp_ns_of(message)
+        offset_ns = round(1e9 * self.config.node.cloud_time_offset_s)
+        stamp_ns = messages.stamp_ns_of(message) + offset_ns
         points = self._admitted(stamp_ns, message, now_ns)
         if isinstance(points, Skip):
             self._skip(points)
@@ -177,14 +189,14 @@ class Worker:
         self._warn("clock_jump", "time jumped back: everything remembered is forgotten")
         newest_ns = self._poses.newest_ns
         if newest_ns is not None and newest_ns - stamp_ns > JUMP_NS:
-            self._poses.clear()
+            self._source.clear()
         if self._transforms is not None:
             self._transforms.clear()
         self._forget("clock_jump", "time jumped back")
 
     def stop(self) -> None:
         """Nothing more will be heard for a while: forget everything."""
-        self._poses.clear()
+        self._source.clear()
         if self._transforms is not None:
             self._transforms.clear()
         self._forget("deactivated", "the node was deactivated")

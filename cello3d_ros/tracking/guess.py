@@ -8,6 +8,7 @@ import numpy as np
 
 from cello3d_ros.config import InputConfig
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.gaussian import to_left
 from cello3d_ros.geometry.pose_track import PoseError, PoseNotYetError
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.geometry.transforms import TransformTree, UnknownFrameError
@@ -15,6 +16,16 @@ from cello3d_ros.tracking.odometry import PoseSource
 
 ODOMETRY, EXTRAPOLATED, CONSTANT_VELOCITY = "odometry", "extrapolated", "constant_velocity"
 EXTERNAL = "external"
+
+
+_SAME = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+_FIXED_FRAMES = {"map", "odom", "earth", "world"}  # REP 105, and what simulators call it
+
+
+class FixedFrameError(PoseError):
+    """Clouds are in a frame that does not move with the sensor."""
+
+    reason = "fixed_frame"
 
 
 def _identity() -> Array:
@@ -25,9 +36,10 @@ def _identity() -> Array:
 class Place:
     """Where the sensor is at the stamp of a cloud, in which frames and who says so.
 
-    T_odom_sensor: (4, 4), None when nobody says it.  T_base_sensor: (4, 4).  T_map_odom: (4, 4),
-    where the frame of the odometry is in that of the reference cloud; None when only answers can
-    tell.  guess: ODOMETRY, EXTRAPOLATED, CONSTANT_VELOCITY or EXTERNAL.  epoch: as in PoseSource.
+    T_odom_sensor: (4, 4), None when nobody says it; Y_odom: (6, 6), its right covariance, None
+    when odometry gives none.  T_base_sensor: (4, 4).  T_map_odom: (4, 4), where the frame of the
+    odometry is in that of the reference cloud; None when only answers can tell.  guess: ODOMETRY,
+    EXTRAPOLATED, CONSTANT_VELOCITY or EXTERNAL.  epoch: as in PoseSource.
     """
 
     T_odom_sensor: Array | None
@@ -38,19 +50,29 @@ class Place:
     base_frame: str = "base_link"
     sensor_frame: str = "lidar"
     epoch: int = 1
+    Y_odom: Array | None = None
 
 
 class Locator:
     """Says where the sensor is, from odometry or the external registration and the extrinsic."""
 
     def __init__(
-        self, config: InputConfig, source: PoseSource, transforms: TransformTree | None = None
+        self,
+        config: InputConfig,
+        source: PoseSource,
+        transforms: TransformTree | None = None,
+        extrinsic_is_given: bool = False,
     ) -> None:
-        """source: odometry or external poses.  transforms: /tf, or None for T_base_sensor."""
+        """source: odometry or external poses.  transforms: /tf, or None for T_base_sensor.
+
+        extrinsic_is_given: whether somebody has said T_base_sensor, be it the identity.
+        """
         self.config = config
         self.source = source
         self.transforms = transforms
         self.map_frame = ""  # of the reference cloud, once there is one
+        self.warning = ""  # what seems wrong with the frames, in a sentence
+        self._extrinsic_is_given = extrinsic_is_given
 
     def place(self, stamp_ns: int, sensor_frame: str, is_late: bool) -> Place:
         """Return where the sensor is at a stamp.
@@ -61,20 +83,55 @@ class Locator:
         T_odom_base, guess = self._base(stamp_ns, is_late)
         odom_frame = self.source.frame_id or "odom"
         base_frame = self.source.child_frame_id or self.config.base_frame
+        self._check_frames(sensor_frame, base_frame, odom_frame)
         T_base_sensor = self._extrinsic(stamp_ns, base_frame, sensor_frame)
+        Y = self.source.covariance(stamp_ns) if guess == ODOMETRY else None
         return Place(
-            None if T_odom_base is None else T_odom_base @ T_base_sensor,
-            T_base_sensor,
-            self._map(stamp_ns, odom_frame),
-            guess,
-            odom_frame,
-            base_frame,
-            sensor_frame,
-            self.source.epoch,
+            T_odom_sensor=None if T_odom_base is None else T_odom_base @ T_base_sensor,
+            T_base_sensor=T_base_sensor,
+            T_map_odom=self._map(stamp_ns, odom_frame),
+            guess=guess,
+            odom_frame=odom_frame,
+            base_frame=base_frame,
+            sensor_frame=sensor_frame,
+            epoch=self.source.epoch,
+            Y_odom=None if Y is None else to_left(se3.inverse(T_base_sensor), Y),
         )
+
+    def _check_frames(self, sensor_frame: str, base_frame: str, odom_frame: str) -> None:
+        """Raise FixedFrameError for clouds that are not in a frame of the sensor, or warn."""
+        frame, base, odom = (name.strip("/") for name in (sensor_frame, base_frame, odom_frame))
+        fixed = {odom, self.map_frame.strip("/"), *_FIXED_FRAMES} - {""}
+        through_odom = self.transforms is not None and self.transforms.leads_through(
+            base, frame, odom
+        )
+        if frame != base and (frame in fixed or through_odom):
+            raise FixedFrameError(
+                f"the clouds are in {sensor_frame!r}, which does not move with the sensor: "
+                "registration needs them as the sensor saw them, in its own frame"
+            )
+        self.warning = ""
+        if self.transforms is not None or self._extrinsic_is_given or not self.source.epoch:
+            return
+        names_no_child = not self.source.child_frame_id
+        if self.config.registration == "external" and names_no_child:
+            return
+        if not frame:
+            self.warning = (
+                "the clouds name no frame_id: they are taken as seen from "
+                f"T_base_sensor in {base_frame!r}"
+            )
+        elif frame != base and self.config.T_base_sensor == _SAME:
+            self.warning = (
+                f"the clouds are in {sensor_frame!r} and the odometry is of {base_frame!r}, but "
+                "T_base_sensor is the identity: set node.T_base_sensor, or node.use_tf to take "
+                "it from /tf"
+            )
 
     def _base(self, stamp_ns: int, is_late: bool) -> tuple[Array | None, str]:
         config, poses = self.config, self.source.poses
+        if (sentence := self.source.rejection) and config.guess_without_odometry == "skip":
+            raise PoseNotYetError(sentence)
         if config.registration == "external":
             return poses.nearest(stamp_ns, config.external_tolerance_s), EXTERNAL
         policy = config.guess_without_odometry

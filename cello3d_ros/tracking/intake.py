@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import statistics
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from cello3d_ros.geometry.pose_track import PoseError, PoseNotYetError
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.geometry.transforms import UnknownFrameError
 from cello3d_ros.tracking.guess import Place
 
 JUMP_NS = (
@@ -18,7 +18,7 @@ JUMP_NS = (
 _N_WAITING = 64  # clouds that wait
 _N_POINTS = 8_000_000  # points of all of them: 200 MB
 _N_CLOUDS = 10  # whose times of arrival say how often clouds come
-_N_WORKS = 2  # pieces of work in a row that are too long are no accident
+_N_WORKS = 5  # pieces of work, most of which are too long under overload
 
 
 @dataclass(frozen=True)
@@ -82,11 +82,11 @@ class Intake:
 
     @property
     def is_overloaded(self) -> bool:
-        """Whether the last pieces of work each took longer than a cloud takes to come."""
-        if len(self._worked_s) < _N_WORKS or len(self._came_s) < 2:
+        """Whether most of the last pieces of work took longer than clouds take to come."""
+        if len(self._worked_s) < 3 or len(self._came_s) < 2:
             return False
         period_s = (self._came_s[-1] - self._came_s[0]) / (len(self._came_s) - 1)
-        return min(self._worked_s) > period_s
+        return statistics.median(self._worked_s) > period_s
 
     def note_work(self, seconds: float) -> None:
         """Note how long the work on a cloud took."""
@@ -178,8 +178,8 @@ class Intake:
         return Skip(job.stamp_ns, "superseded", sentence)
 
     def _without_place(self, job: Job, error: PoseError) -> Skip:
-        if isinstance(error, UnknownFrameError):
-            return Skip(job.stamp_ns, "unknown_frame", str(error))
+        if error.reason != PoseError.reason:
+            return Skip(job.stamp_ns, error.reason, str(error))
         reason = f"no_{self._what.replace(' ', '_')}"
         sentence = f"no {self._what} at the stamp of the cloud: {error}"
         return Skip(job.stamp_ns, reason, sentence)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.pose_track import PoseError, PoseTrack
 from cello3d_ros.geometry.se3 import Array
+
+_N_COVARIANCES = 10_000  # remembered
 
 
 class PoseSource:
@@ -18,11 +22,47 @@ class PoseSource:
         self.poses = poses
         self.frame_id = self.child_frame_id = ""
         self.epoch = 0
+        self._n_rejected, self._last_rejection = 0, ""  # since a pose was of use
+        self._covariances: deque[tuple[int, Array]] = deque(maxlen=_N_COVARIANCES)
+
+    def reject(self, sentence: str) -> None:
+        """Note a message that was of no use, and why."""
+        self._n_rejected += 1
+        self._last_rejection = sentence
+
+    @property
+    def rejection(self) -> str:
+        """Why there is no pose although messages came, or ""."""
+        if len(self.poses) or not self._n_rejected:
+            return ""
+        return (
+            f"all {self._n_rejected} messages of {self.poses.what} were rejected, the last "
+            f"because {self._last_rejection}"
+        )
+
+    def clear(self) -> None:
+        """Forget all poses."""
+        self.poses.clear()
+        self._covariances.clear()
+        self._n_rejected = 0
+
+    def covariance(self, stamp_ns: int) -> Array | None:
+        """Return the covariance (6, 6) of the newest pose not after a stamp, if it has one."""
+        found = (Y for before_ns, Y in reversed(self._covariances) if before_ns <= stamp_ns)
+        return next(found, None)
 
     def hear(
-        self, stamp_ns: int, T: Array, frame_id: str, child_frame_id: str, max_speed_m_s: float
+        self,
+        stamp_ns: int,
+        T: Array,
+        frame_id: str,
+        child_frame_id: str,
+        max_speed_m_s: float,
+        covariance: Array | None = None,
     ) -> str:
         """Remember a pose; return why a new epoch begins with it, or "".
+
+        covariance: (6, 6), right side, None where it has none.
 
         Raises PoseError, and nothing has changed, when the pose is none or not later.
         """
@@ -35,8 +75,11 @@ class PoseSource:
             raise PoseError(f"the stamp is {what} the message before")
         break_ = self._break(stamp_ns, T, frame_id, child_frame_id, max_speed_m_s)
         if break_:
-            self.poses.clear()
+            self.clear()
         self.poses.add(stamp_ns, T)
+        self._n_rejected = 0
+        if covariance is not None:
+            self._covariances.append((stamp_ns, covariance))
         self.epoch += bool(break_) or self.epoch == 0
         self.frame_id, self.child_frame_id = frame_id, child_frame_id
         return break_

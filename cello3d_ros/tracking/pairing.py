@@ -26,6 +26,7 @@ class Consecutive:
 
     map_frame = ""  # the frame that answers are in where the reference is a map
     needs_chain = True  # whether a pause or a break of the odometry leaves nothing to register to
+    knows_odometry = True  # whether odometry says where the scan is, seen from the reference
 
     def __init__(self) -> None:
         self._reference: Link | None = None
@@ -74,6 +75,7 @@ class ToMap(Consecutive):
 
     def __init__(self) -> None:
         super().__init__()
+        self.knows_odometry = False
         self._map: Map | None = None
         self._T_map_odom: Array = np.eye(4)
 
@@ -91,7 +93,7 @@ class ToMap(Consecutive):
 
     def begin(self, link: Link | None) -> None:
         """Forget where the odometry is in the map."""
-        self._T_map_odom = np.eye(4)
+        self._T_map_odom, self.knows_odometry = np.eye(4), False
 
     def reference(
         self, frame: Frame, chain: Chain, config: PairingConfig, clouds: CloudConfig
@@ -101,6 +103,7 @@ class ToMap(Consecutive):
             raise NoReferenceError("no cloud has been received on reference_points")
         given = frame.place.T_map_odom
         T_map_odom = self._T_map_odom if given is None else given
+        self.knows_odometry |= given is not None
         if frame.T_odom_sensor is None:
             T_map_sensor = chain.predicted(frame.stamp_ns)
         else:
@@ -115,6 +118,7 @@ class ToMap(Consecutive):
         place = link.frame.place
         if place.guess == ODOMETRY and place.T_odom_sensor is not None:
             self._T_map_odom = link.pose.T @ se3.inverse(place.T_odom_sensor)
+            self.knows_odometry = True
 
     def fail(self, chain: Chain) -> None:
         """The map stays."""

@@ -19,13 +19,20 @@ from cello3d_ros.covariance.estimator import Estimate, Estimator, draws, needs_s
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import ModelError, RegistrationError
 from cello3d_ros.geometry.gaussian import GaussianPose, extended
-from cello3d_ros.geometry.se3 import Array, inverse
+from cello3d_ros.geometry.se3 import Array, inverse, log
 from cello3d_ros.geometry.transforms import seen_from_base
+from cello3d_ros.tracking.agreement import (
+    Alternation,
+    OdometryDisagreesError,
+    contradiction,
+    step_covariance,
+)
 from cello3d_ros.tracking.chain import Chain, Frame, Link
 from cello3d_ros.tracking.external import checked
 from cello3d_ros.tracking.guess import CONSTANT_VELOCITY, EXTERNAL, ODOMETRY, Place
 from cello3d_ros.tracking.map import Map
 from cello3d_ros.tracking.pairing import PAIRINGS, ToMap
+from cello3d_ros.tracking.planar import on_the_floor
 
 _ORIGIN = np.eye(4)
 _N_THREADS = min(os.cpu_count() or 1, 4)  # more than that is not worth starting
@@ -51,7 +58,8 @@ class Answer:
     in ``frame_id``, by this registration; pose: its accumulated pose in ``pose_frame_id``; both as
     they are published, with right covariances.  span_s: the time between the two scans, None where
     the reference is not a scan shortly before.  guess: where the first guess came from.  offset:
-    (6,), the twist by which ICP would move an external pose, else None.
+    (6,), the twist by which ICP would move an external pose, else None.  disagreement: why
+    odometry contradicts it, in a sentence, or "".
     """
 
     stamp_ns: int
@@ -65,18 +73,17 @@ class Answer:
     span_s: float | None = None
     guess: str = ODOMETRY
     offset: Array | None = None
+    disagreement: str = ""
 
 
 class _Found(NamedTuple):
-    """A registration of the sensor, and where its first guess came from."""
+    """A registration of the sensor, what is made of it, and where its first guess came from."""
 
     estimate: Estimate
+    step: GaussianPose
     guess: str
-    offset: Array | None
-
-    @property
-    def step(self) -> GaussianPose:
-        return GaussianPose(self.estimate.registration.T_ref_read, self.estimate.covariance)
+    offset: Array | None = None
+    disagreement: str = ""
 
 
 class Tracker:
@@ -90,6 +97,12 @@ class Tracker:
         self._pairing = PAIRINGS[config.pairing]()
         self._chain = Chain()
         self._rival: Link | None = None  # failed against a first scan that nothing has fitted
+        self._alternation = Alternation()
+
+    @property
+    def warning(self) -> str:
+        """What seems wrong with the clouds altogether, or ""."""
+        return self._alternation.sentence
 
     def reset(self, reason: str = "") -> None:
         """Forget the reference and the chain; the next scan starts anew.  A map stays."""
@@ -130,6 +143,7 @@ class Tracker:
         except (RegistrationError, ModelError):
             rival, match = self._rival, self._match(frame, rng)
             if rival is None or match is None:
+                self._alternation.add(None)
                 self._fail(frame)
                 raise
             self.reset("two scans fit each other but not the first of the chain")
@@ -182,12 +196,33 @@ class Tracker:
             self._shaped(reference.frame),
         )
         estimator = estimator_of(self.model, self.pipeline, self.config)
-        if guess != EXTERNAL:
-            return _Found(estimator.register(*clouds, T_init, rng), guess, None)
-        limit = self.config.max_external_offset
-        registration, d = checked(*clouds, T_init, self.pipeline.icp, limit, rng)
-        found = estimator.judge(*clouds, registration, rng)
-        return _Found(found._replace(covariance=found.covariance + np.outer(d, d)), guess, d)
+        if guess == EXTERNAL:
+            limit = self.config.max_external_offset
+            registration, d = checked(*clouds, T_init, self.pipeline.icp, limit, rng)
+            found = estimator.judge(*clouds, registration, rng)
+            found = found._replace(covariance=found.covariance + np.outer(d, d))
+            return _Found(found, GaussianPose(found.T_ref_read, found.covariance), guess, d)
+        found = estimator.register(*clouds, T_init, rng)
+        step = GaussianPose(found.T_ref_read, found.covariance)
+        disagreement = ""
+        if guess == ODOMETRY and self._pairing.knows_odometry:
+            disagreement = self._disagreement(reading, reference, T_init, step)
+        if self.config.planar:
+            step = on_the_floor(step, T_init, reading.place.T_base_sensor)
+        return _Found(found, step, guess, disagreement=disagreement)
+
+    def _disagreement(
+        self, reading: Frame, reference: Link, T_init: Array, step: GaussianPose
+    ) -> str:
+        """Return why odometry contradicts a registration, or ""; raise it unless published."""
+        xi = log(inverse(T_init) @ step.T)
+        P = step_covariance(reference.frame.place.Y_odom, reading.place.Y_odom, T_init)
+        Y = np.zeros((6, 6)) if P is None else P + step.Y
+        found = contradiction(xi, Y, self.config)
+        if found and not self.config.publish_disagreeing:
+            raise OdometryDisagreesError(found)
+        self._alternation.add(xi)
+        return found
 
     def _match(self, frame: Frame, rng: np.random.Generator) -> _Found | None:
         """Return what a scan is to the one that failed before it, or None."""
@@ -201,8 +236,11 @@ class Tracker:
         T_odom_ref, T_odom_read = reference.frame.T_odom_sensor, reading.T_odom_sensor
         if T_odom_ref is not None and T_odom_read is not None:
             return inverse(T_odom_ref) @ T_odom_read, reading.place.guess
-        T_predicted = self._chain.predicted(reading.stamp_ns)
-        return inverse(reference.pose.T) @ T_predicted, CONSTANT_VELOCITY
+        T_init = inverse(reference.pose.T) @ self._chain.predicted(reading.stamp_ns)
+        if self.config.planar and self._pairing.needs_chain:  # it does not leave its floor
+            flat = GaussianPose(T_init, np.eye(6))
+            T_init = on_the_floor(flat, _ORIGIN, reading.place.T_base_sensor).T
+        return T_init, CONSTANT_VELOCITY
 
     def _accept(self, frame: Frame, found: _Found, reference: Link, pose: GaussianPose) -> None:
         """Take an answered scan into the chain, and as the next reference if it is one."""
@@ -242,6 +280,7 @@ class Tracker:
             span_s=span_s,
             guess=found.guess,
             offset=found.offset,
+            disagreement=found.disagreement,
         )
 
     def _fail(self, frame: Frame) -> None:

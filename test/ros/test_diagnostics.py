@@ -19,7 +19,7 @@ from cello3d_ros.errors import (
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import GaussianPose
 from cello3d_ros.registration.icp import Registration
-from cello3d_ros.ros.diagnostics import ERROR, OK, WARN, Statistics, Verdict, judged
+from cello3d_ros.ros.diagnostics import ERROR, OK, WARN, State, Statistics, Verdict, judged
 from cello3d_ros.tracking.tracker import Answer
 
 ROOT = Path(__file__).parents[2]
@@ -54,7 +54,7 @@ def answered(statistics: Statistics, C: np.ndarray, **settings) -> None:
 
 
 def said(statistics: Statistics) -> tuple[int, str, dict[str, str]]:
-    status = statistics.message("node: registration", 5, CONFIG, 2, "told to", 1).status[0]
+    status = statistics.message("node: registration", 5, CONFIG, State(2, "told to", 1)).status[0]
     return status.level[0], status.message, {item.key: item.value for item in status.values}
 
 
@@ -88,7 +88,9 @@ def errors_of_the_tracker() -> list[type[Cello3dError]]:
 def reasons() -> set[str]:
     """Every reason that a cloud can be skipped for, as written in the sources."""
     found = {"internal", *(kind.reason for kind in errors_of_the_tracker())}
-    files = [path for room in ("ros", "tracking") for path in (SOURCES / room).glob("*.py")]
+    files = [
+        path for room in ("ros", "tracking", "geometry") for path in (SOURCES / room).glob("*.py")
+    ]
     for path in files:
         for node in ast.walk(ast.parse(path.read_text())):
             words: list[ast.AST] = []
@@ -98,6 +100,8 @@ def reasons() -> set[str]:
                 words = [node.args[0]] if name == "self._forget" else words
             elif isinstance(node, ast.Subscript) and ast.unparse(node.value) == "self.dropped":
                 words = [node.slice]
+            elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "reason":
+                words = [node.value]  # of an error
             elif isinstance(node, ast.FunctionDef) and node.name == "stamp_order":
                 words = list(ast.walk(node))
             found |= {word.value for word in words if isinstance(word, ast.Constant)}
@@ -209,3 +213,21 @@ def test_a_verdict_is_of_the_last_answer_only(statistics) -> None:
     assert said(statistics)[0] == ERROR
     answered(statistics, 1e-6 * np.eye(6))
     assert said(statistics)[:2] == Verdict(OK, "answered")
+
+
+def test_warnings_are_never_ok_and_do_not_hide_what_else_is_wrong(statistics) -> None:
+    wrong = State(0, "", 0, ("two lidars on one topic", "no frame_id"))
+    answered(statistics, 1e-6 * np.eye(6))
+    status = statistics.message("node: registration", 5, CONFIG, wrong).status[0]
+    assert (status.level[0], status.message) == (WARN, "two lidars on one topic; no frame_id")
+    statistics.fail(7, "no_overlap", "too little in common")
+    status = statistics.message("node: registration", 5, CONFIG, wrong).status[0]
+    assert (
+        status.message == "no answer: too little in common; two lidars on one topic; no frame_id"
+    )
+
+
+def test_an_answer_that_odometry_contradicts_is_never_ok() -> None:
+    C = 1e-6 * np.eye(6)
+    verdict = judged(C, an_estimate(C), CONFIG, "the registration is 2 m from where odometry led")
+    assert (verdict.level, verdict.sentence[:20]) == (WARN, "the registration is ")

@@ -1,6 +1,7 @@
 """What goes wrong outside of a registration costs a cloud or a reference, never the node."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace as Info
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import rclpy
 
+from cello3d_ros.config import Config
 from cello3d_ros.geometry import se3
 from cello3d_ros.ros import messages
 from cello3d_ros.ros.node import CovarianceNode
@@ -78,3 +80,51 @@ def test_only_clouds_of_one_and_the_same_publisher_are_missed(node, monkeypatch)
         monkeypatch.setattr(node, "get_publishers_info_by_topic", lambda _, found=found: found)
         heard.append(node._n_unheard({"publication_sequence_number": number}))
     assert heard == [0, 0, 2, 0, 1, 0, 0, 0, 0]
+
+
+def test_a_constant_offset_of_the_clouds_clock_is_added(node) -> None:
+    node._worker.set_config(with_node(node, cloud_time_offset_s=-37.0))
+    for k in range(3):
+        T = se3.exp([0.1 * k, 0, 0, 0, 0, 0.02 * k])
+        points = se3.transform(se3.inverse(T), room(np.random.default_rng(k)))
+        stamp_ns = 100 * S + k * S // 10
+        node._on_pose(messages.odometry_to(stamp_ns, "odom", "lidar", T))
+        node._on_cloud(messages.cloud_to(stamp_ns + 37 * S, "lidar", points), {})
+        node._work()
+    assert node._statistics.counts["answered"] == 2
+    assert node._statistics._last_stamp_ns == 100 * S + 2 * S // 10
+
+
+def with_node(node: CovarianceNode, **settings: object) -> Config:
+    return replace(node._config, node=replace(node._config.node, **settings))
+
+
+def test_odometry_from_the_future_is_named_where_clouds_wait_in_vain(node) -> None:
+    ahead_ns = node._now_ns() + 5 * S
+    for k in range(4):
+        node._on_pose(messages.odometry_to(ahead_ns + k, "odom", "lidar", np.eye(4)))
+    node._on_cloud(messages.cloud_to(node._now_ns(), "lidar", room(np.random.default_rng(0))), {})
+    for _ in range(20):
+        node._expire()
+    assert node._statistics.dropped["no_odometry"] == 1
+    assert "all 4 messages of odometry were rejected" in node._statistics._last_failure
+    assert "s in the future" in node._statistics._last_failure
+    assert "all 4 messages" in node._state().warnings[0]
+
+
+def test_a_publisher_whose_clouds_never_arrive_names_the_profile(node, monkeypatch) -> None:
+    monkeypatch.setattr(node, "count_publishers", lambda topic: 1)
+    assert node._state().warnings == ()
+    for _ in range(5):
+        node._look_about()
+    assert "fastdds_large_clouds.xml" in node._state().warnings[0]
+    hear(node, 0)
+    node._look_about()
+    assert node._state().warnings == ()
+
+
+def test_two_publishers_of_clouds_are_told(node, monkeypatch) -> None:
+    found = [publisher(1), publisher(2)]
+    monkeypatch.setattr(node, "get_publishers_info_by_topic", lambda _: found)
+    hear(node, 0)
+    assert "2 publishers send clouds on /points" in node._state().warnings[0]

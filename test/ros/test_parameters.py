@@ -1,8 +1,18 @@
 """Parameters of a running node: descriptions, ranges, live changes."""
 
+import dataclasses
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
+import rclpy
 from rcl_interfaces.srv import DescribeParameters
+from rclpy.parameter import Parameter
+
+from cello3d_ros.config import NodeConfig
+from cello3d_ros.errors import ConfigError
+from cello3d_ros.ros import parameters
+from cello3d_ros.ros.node import CovarianceNode
 
 
 def test_descriptions_and_ranges_come_from_the_configuration(ask) -> None:
@@ -65,3 +75,51 @@ def test_modes_and_scale_change_from_one_cloud_to_the_next(change, robot) -> Non
     assert np.trace(C) == pytest.approx(4.0 * plain, rel=1e-6)
     assert change("node.scale", 1.0).successful
     assert not change("node.covariance_mode", "best").successful
+
+
+def test_every_default_survives_a_dump() -> None:
+    """ros2 param dump writes 1e-05, and its load takes that for a string."""
+    for section in parameters._SECTIONS.values():
+        for setting in dataclasses.fields(section):
+            values = setting.default if isinstance(setting.default, tuple) else (setting.default,)
+            assert not any("e" in repr(v) for v in values if isinstance(v, float)), setting.name
+
+
+def test_a_backend_without_its_library_is_refused_and_not_every_cloud(change, robot) -> None:
+    if find_spec("small_gicp") is not None:
+        pytest.skip("small_gicp is installed")
+    verdict = change("icp.backend", "small_gicp")
+    assert not verdict.successful
+    assert "icp.backend small_gicp needs small_gicp" in verdict.reason
+    robot.assert_right_again()
+
+
+def test_tf_that_would_cut_the_tree_is_refused(change, robot) -> None:
+    with pytest.raises(ConfigError, match="output_frame to base"):
+        NodeConfig(use_tf=True, publish_tf=True)
+    NodeConfig(use_tf=True, publish_tf=True, output_frame="base")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("node.T_base_sensor", [1.0, 0.0, 0.0], "needs x y z and a unit quaternion"),
+        ("grid.n_cells", [8, 8], "needs three numbers"),
+        ("node.model", "/any.npz", ""),
+    ],
+)
+def test_before_it_is_configured_nonsense_is_refused_as_well(
+    model_path, name, value, sentence
+) -> None:
+    rclpy.init(args=["--ros-args", "-p", f"node.model:={model_path}", "--log-level", "fatal"])
+    try:
+        node = CovarianceNode("unconfigured")
+        node.start()
+        node.trigger_deactivate()
+        node.trigger_cleanup()
+        (verdict,) = node.set_parameters([Parameter(name, value=value)])
+        assert verdict.successful == (sentence == "")
+        assert sentence in verdict.reason
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()

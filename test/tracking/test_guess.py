@@ -7,9 +7,10 @@ import pytest
 
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.gaussian import to_left
 from cello3d_ros.geometry.pose_track import PoseMissingError, PoseNotYetError, PoseTrack
 from cello3d_ros.geometry.transforms import TransformTree, UnknownFrameError
-from cello3d_ros.tracking.guess import Locator
+from cello3d_ros.tracking.guess import FixedFrameError, Locator
 from cello3d_ros.tracking.odometry import PoseSource
 
 S = 10**9
@@ -128,3 +129,65 @@ def _hear(transforms: TransformTree, parent: str, child: str, T: np.ndarray) -> 
     header = Message(frame_id=parent, stamp=Message(sec=0, nanosec=0))
     item = Message(header=header, child_frame_id=child, transform=transform)
     assert transforms.add(Message(transforms=[item]), True) == []
+
+
+@pytest.mark.parametrize("frame", ["odom", "/odom", "map", "world", "earth"])
+def test_clouds_in_a_frame_that_stands_still_are_refused(frame: str) -> None:
+    where = locator((S, STEP))
+    with pytest.raises(FixedFrameError, match="does not move with the sensor") as caught:
+        where.place(S, frame, is_late=False)
+    assert caught.value.reason == "fixed_frame"
+
+
+def test_clouds_in_the_frame_of_the_map_or_beyond_the_odometry_are_refused() -> None:
+    where = locator((S, STEP))
+    where.map_frame = "site"
+    with pytest.raises(FixedFrameError):
+        where.place(S, "site", is_late=False)
+    transforms = TransformTree(1.0, 10.0)
+    for parent, child in (("base_link", "lidar"), ("odom", "base_link"), ("city", "odom")):
+        _hear(transforms, parent, child, X)
+    where = locator((S, STEP), transforms=transforms)
+    with pytest.raises(FixedFrameError):
+        where.place(S, "city", is_late=False)
+    np.testing.assert_allclose(where.place(S, "lidar", is_late=False).T_base_sensor, X)
+
+
+def test_the_identity_is_not_assumed_without_a_word() -> None:
+    where = locator((S, STEP))
+    where.place(S, "lidar", is_late=False)
+    assert "clouds are in 'lidar' and the odometry is of 'base_link'" in where.warning
+    where.place(S, "base_link", is_late=False)
+    assert where.warning == ""
+    where.place(S, "", is_late=False)
+    assert "no frame_id" in where.warning
+    given = locator((S, STEP), T_base_sensor=(0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    given.place(S, "lidar", is_late=False)
+    assert given.warning == ""
+    on_purpose = Locator(NodeConfig(), where.source, extrinsic_is_given=True)
+    on_purpose.place(S, "lidar", is_late=False)
+    assert on_purpose.warning == ""
+
+
+def test_where_all_odometry_was_rejected_the_cloud_is_told_so() -> None:
+    where = locator()
+    for _ in range(3):
+        where.source.reject("the stamp is 37.000 s in the future")
+    with pytest.raises(PoseNotYetError, match=r"all 3 messages .* 37\.000 s in the future"):
+        where.place(S, "lidar", is_late=True)
+    where.source.hear(S, STEP, "odom", "base_link", 50.0)
+    where.place(S, "lidar", is_late=True)
+    assert where.source.rejection == ""
+
+
+def test_a_place_has_the_covariance_of_the_odometry_at_the_sensor() -> None:
+    Y = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
+    numbers = (0.2, 0.0, 1.0, 0.0, 0.0, float(np.sin(0.25)), float(np.cos(0.25)))
+    where = locator(T_base_sensor=numbers)
+    where.source.hear(S, STEP, "odom", "base_link", 50.0, Y)
+    X_ = se3.pose(numbers[:3], numbers[3:])
+    found = where.place(S, "lidar", is_late=False).Y_odom
+    np.testing.assert_allclose(to_left(X_, found), Y, atol=1e-15)
+    where.source.hear(2 * S, STEP, "odom", "base_link", 50.0)
+    where.source.clear()
+    assert where.source.covariance(S) is None

@@ -15,6 +15,7 @@ from cello3d_ros.registration.icp import Registration
 from cello3d_ros.tracking import external as external_module
 from cello3d_ros.tracking import map as map_module
 from cello3d_ros.tracking import tracker as module
+from cello3d_ros.tracking.agreement import OdometryDisagreesError
 from cello3d_ros.tracking.external import DisagreementError
 from cello3d_ros.tracking.guess import Place
 from cello3d_ros.tracking.pairing import NoReferenceError
@@ -515,3 +516,75 @@ def test_a_step_has_a_time_only_where_its_reference_is_a_scan_shortly_before(ask
     on_map = tracker_with(pairing="topics")
     on_map.take_map(7, MAP, "map")
     assert on_map.step(S, POINTS, Place(IN_MAP)).span_s is None
+
+
+@pytest.mark.parametrize("pairing_name", ["consecutive", "keyframe"])
+def test_a_registration_that_odometry_makes_impossible_is_refused_or_never_ok(
+    asked, monkeypatch, pairing_name
+) -> None:
+    fixed, wrong = module.Estimator.register, shift(1.5)
+
+    def register(self, P, Q, T, rng):
+        return fixed(self, P, Q, T @ wrong, rng)
+
+    trackers = [
+        tracker_with(pairing=pairing_name, publish_disagreeing=publish)
+        for publish in (False, True)
+    ]
+    for tracker in trackers:
+        for i in range(2):
+            tracker.step(i * S, POINTS, Place(shift(0.1 * i)))
+    monkeypatch.setattr(module.Estimator, "register", register)
+    with pytest.raises(OdometryDisagreesError, match=r"1\.500 m .* more than 1 m"):
+        trackers[0].step(2 * S, POINTS, Place(shift(0.2)))
+    assert trackers[0].n_failures == 1
+    answer = trackers[1].step(2 * S, POINTS, Place(shift(0.2)))
+    assert "1.500 m" in answer.disagreement
+    answer = trackers[1].step(3 * S, POINTS, NOWHERE)  # nobody says where it should be
+    assert answer.disagreement == ""
+
+
+def test_odometry_that_is_sure_of_itself_contradicts_sooner(asked, monkeypatch) -> None:
+    fixed, wrong = module.Estimator.register, shift(0.5)
+    tracker = tracker_with()
+    sure = {"Y_odom": 1e-4 * np.eye(6)}
+    monkeypatch.setitem(globals(), "WIDE", 1e-6 * np.eye(6))
+    tracker.step(0, POINTS, Place(shift(0.0), **sure))
+    monkeypatch.setattr(
+        module.Estimator, "register", lambda self, P, Q, T, rng: fixed(self, P, Q, T @ wrong, rng)
+    )
+    with pytest.raises(OdometryDisagreesError, match="6 standard deviations"):
+        tracker.step(S, POINTS, Place(shift(0.1), **sure))
+
+
+def test_on_a_map_odometry_contradicts_only_once_it_is_located(asked, monkeypatch) -> None:
+    fixed, far = module.Estimator.register, [shift(3.0)]
+    monkeypatch.setattr(
+        module.Estimator, "register", lambda self, P, Q, T, rng: fixed(self, P, Q, T @ far[0], rng)
+    )
+    tracker = tracker_with(pairing="topics")
+    tracker.take_map(7, MAP, "map")
+    assert tracker.step(0, POINTS, Place(IN_MAP)) is not None  # the two need not coincide
+    with pytest.raises(OdometryDisagreesError):
+        tracker.step(S, POINTS, Place(IN_MAP))
+
+
+def test_a_planar_robot_has_z_roll_and_pitch_of_its_odometry(asked, monkeypatch) -> None:
+    fixed, error = module.Estimator.register, se3.exp([0.02, 0.01, 0.3, 0.1, -0.1, 0.05])
+    monkeypatch.setattr(
+        module.Estimator, "register", lambda self, P, Q, T, rng: fixed(self, P, Q, T @ error, rng)
+    )
+    tracker = tracker_with(planar=True)
+    turns = [se3.exp([0.3 * i, 0, 0, 0, 0, 0.1 * i]) for i in range(4)]
+    for i, T in enumerate(turns):
+        answer = tracker.step(i * S, POINTS, Place(T))
+    assert abs(answer.pose.T[2, 3]) < 1e-12
+    np.testing.assert_allclose(answer.pose.T[2, :3], [0, 0, 1], atol=1e-12)
+    assert abs(answer.pose.T[0, 3] - turns[3][0, 3]) > 0.02
+    np.testing.assert_allclose(answer.step.Y[2, 2], 0.005**2)
+    np.testing.assert_allclose(answer.step.Y[0, 0], WIDE[0, 0])
+    np.testing.assert_allclose(
+        answer.estimate.T_ref_read, se3.inverse(turns[2]) @ turns[3] @ error, atol=1e-12
+    )
+    flat = tracker.step(4 * S, POINTS, NOWHERE)  # the guess stays on the floor, too
+    assert abs(flat.pose.T[2, 3]) < 1e-12
