@@ -1,4 +1,4 @@
-"""The node, RViz and a bag: ros2 launch cello3d_ros demo.launch.py bag:=bags/demo."""
+"""The node and a bag: ros2 launch cello3d_ros demo.launch.py bag:=bags/demo."""
 
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
@@ -11,7 +11,7 @@ ARGUMENTS = {
     "bag": ("bags/demo", "rosbag2 folder with /points and /odom"),
     "model": ("", "model file; empty is the shipped one"),
     "covariance_mode": ("", "cello3d, fused, ...; empty is cello3d"),
-    "rviz": ("true", "true to open RViz"),
+    "rviz": ("false", "true to open RViz (package rviz2)"),
 }
 
 

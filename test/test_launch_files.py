@@ -5,8 +5,11 @@ import dataclasses
 import json
 import py_compile
 import re
+import sys
 import xml.etree.ElementTree
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import yaml
@@ -75,6 +78,88 @@ def test_launch_uses_every_argument_and_no_other() -> None:
     assert [name for name in remapped if f'"{name}"' not in heard] == []
 
 
+class Recorded:
+    """Stands for every class of launch: it keeps what it was made of."""
+
+    def __init__(self, *values, **words) -> None:
+        self.values, self.words = values, words
+        self.__dict__.update(words)
+
+
+def started(monkeypatch, **given: str) -> list[Recorded]:
+    """What the launch file starts for some arguments; launch itself is not on PyPI."""
+    path = LAUNCH / "cello3d.launch.py"
+    values = {name: default for name, (default, _) in constant(path, "ARGUMENTS").items()}
+    values |= given
+
+    class Configuration:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def perform(self, context: object) -> str:
+            return values[self.name]
+
+    names = (
+        *("DeclareLaunchArgument", "ExecuteProcess", "OpaqueFunction", "SetEnvironmentVariable"),
+        *("PathJoinSubstitution", "Node", "FindPackageShare", "LaunchDescription"),
+    )
+    whole = SimpleNamespace(
+        LaunchConfiguration=Configuration,
+        **{name: type(name, (Recorded,), {}) for name in names},
+    )
+    for module in ("launch", "launch_ros"):
+        for part in ("", ".actions", ".substitutions"):
+            monkeypatch.setitem(sys.modules, module + part, whole)
+    found: dict[str, Any] = {}
+    exec(compile(path.read_text(), str(path), "exec"), found)
+    return found["actions"](None)
+
+
+def kinds(actions: list[Recorded]) -> list[str]:
+    return [type(action).__name__ for action in actions]
+
+
+def test_launch_sets_only_what_was_given(monkeypatch, tmp_path) -> None:
+    """Otherwise it would win over the parameter file."""
+    monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE", raising=False)
+    params = tmp_path / "mine.yaml"
+    params.write_text("/**: {}")
+    profile, node = started(monkeypatch, params=str(params))
+    assert (type(profile).__name__, type(node).__name__) == ("SetEnvironmentVariable", "Node")
+    assert node.parameters == [str(params)]
+    *_, node = started(monkeypatch, use_sim_time="true", autostart="false", model="m.npz")
+    assert node.parameters == [
+        *({"node.autostart": False}, {"node.model": "m.npz"}, {"use_sim_time": True})
+    ]
+    *_, node, player = started(monkeypatch, bag="bags/demo")
+    assert node.parameters == [{"use_sim_time": True}]
+    assert player.cmd[:4] == ["ros2", "bag", "play", "bags/demo"]
+
+
+def test_launch_leaves_the_dds_profile_of_the_user_alone(monkeypatch) -> None:
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/mine.xml")
+    assert kinds(started(monkeypatch)) == ["Node"]
+
+
+def test_launch_keeps_topics_in_the_namespace_and_rviz_follows(monkeypatch) -> None:
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/mine.xml")
+    node, view = started(monkeypatch, namespace="left", name="judge", points="/lidar", rviz="true")
+    assert dict(node.remappings)["points"] == "/lidar"
+    assert dict(node.remappings)["odom"] == "odom"
+    assert dict(view.remappings) == {
+        "/points": "/lidar",
+        "/odom": "/left/odom",
+        "/covariance_node/pose": "/left/judge/pose",
+        "/covariance_node/odometry": "/left/judge/odometry",
+        "/covariance_node/markers": "/left/judge/markers",
+    }
+
+
+def test_launch_refuses_a_parameter_file_that_is_not_there(monkeypatch) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no file /nowhere\.yaml"):
+        started(monkeypatch, params="/nowhere.yaml")
+
+
 def test_the_demo_passes_on_arguments_that_are_there() -> None:
     assert set(constant(LAUNCH / "demo.launch.py", "ARGUMENTS")) <= set(
         constant(LAUNCH / "cello3d.launch.py", "ARGUMENTS")
@@ -121,7 +206,7 @@ def test_all_files_of_config_are_installed() -> None:
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.name)
 def test_the_examples_configure_the_node(path) -> None:
     tree = yaml.safe_load(path.read_text())
-    config = config_from(tree["covariance_node"]["ros__parameters"], str(path))
+    config = config_from(tree["/**"]["ros__parameters"], str(path))
     assert config != Config()
     for node in tree.values():
         assert list(node) == ["ros__parameters"]
