@@ -64,9 +64,7 @@ def filtered(Q: np.ndarray, hz: float, seed: int = 0) -> tuple[np.ndarray, np.nd
         twist = np.zeros((n, 6))
         for _ in range(round(1.0 / (dt * LIDAR_HZ))):
             true[:, 9:12] += (turn - true[:, 9:12]) * dt
-            twist += np.concatenate(
-                [true[:, 6:9] + 0.5 * dt * true[:, 12:], true[:, 9:12]], axis=1
-            )
+            twist += np.hstack([true[:, 6:9] + 0.5 * dt * true[:, 12:], true[:, 9:12]])
             true = predicted(true, dt)
             F = jacobian(x, dt)
             x, P = predicted(x, dt), F @ P @ np.swapaxes(F, 1, 2) + dt * Q

@@ -71,7 +71,6 @@ def test_a_signal_ends_a_running_node_with_status_0(
         "node.model": model_path,
         "icp.trim": 0.5,
         "icp.trim_ratio": 0.8,
-        "sampling.variance": 0.1,
     }
     with NodeProcess(tmp_path / "log", domain_id, parameters) as process:
         player = Player(domain_id, check=process.check)
@@ -83,7 +82,6 @@ def test_a_signal_ends_a_running_node_with_status_0(
         output = process.output()
     assert "unknown parameter icp.trim has no effect" in output
     assert "not as the model was trained: icp.trim_ratio is 0.8, not 0.7" in output
-    assert "not as the model was trained: sampling.variance is 0.1, not 0.05" in output
     assert "Traceback" not in output
 
 
