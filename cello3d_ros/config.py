@@ -173,6 +173,11 @@ class TrainingConfig(Section):
 class InputConfig(Section):
     """What the node hears, and where and when the sensor is."""
 
+    points_type: str = _setting(
+        "PointCloud2",
+        "type of the clouds: sensor_msgs/PointCloud2 or livox_ros_driver2/CustomMsg",
+        choices=("PointCloud2", "CustomMsg"),
+    )
     T_base_sensor: tuple[float, ...] = _setting(
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
         "sensor in the odometry's child frame: x y z qx qy qz qw",

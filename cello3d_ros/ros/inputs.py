@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from sensor_msgs.msg import PointCloud2
 
 from cello3d_ros.config import NodeConfig
-from cello3d_ros.ros.messages import tf_message
+from cello3d_ros.ros.messages import livox_message, tf_message
 
 
 class Role(Enum):
@@ -62,7 +62,8 @@ def topics(config: NodeConfig) -> list[Topic]:
         ]
     else:
         found.append(Topic(Role.POSE, Odometry, "odom", _best_effort(200)))
-    return [*found, Topic(Role.CLOUD, PointCloud2, "points", _best_effort(5))]
+    kind = PointCloud2 if config.points_type == "PointCloud2" else livox_message()
+    return [*found, Topic(Role.CLOUD, kind, "points", _best_effort(5))]
 
 
 def _best_effort(depth: int) -> QoSProfile:

@@ -151,6 +151,18 @@ def tf_message(parameter: str) -> Any:
     return TFMessage
 
 
+def livox_message() -> Any:
+    """Return livox_ros_driver2/CustomMsg, which Livox's driver brings.  Raises ConfigError."""
+    try:
+        from livox_ros_driver2.msg import CustomMsg
+    except ImportError:
+        raise ConfigError(
+            "parameter node.points_type CustomMsg needs the package livox_ros_driver2: build "
+            "Livox's driver and source its workspace, or let it publish PointCloud2"
+        ) from None
+    return CustomMsg
+
+
 def _cells(covariance: Array) -> Array:
     """Return 36 finite doubles, row by row."""
     cells = np.ascontiguousarray(covariance, dtype=np.float64).reshape(36)

@@ -172,7 +172,7 @@ class CovarianceNode(ManagedNode):
     def _on_reference(self, message: PointCloud2) -> None:
         self._worker.hear_reference(message)
 
-    def _on_cloud(self, message: PointCloud2, info: dict[str, Any]) -> None:
+    def _on_cloud(self, message: Any, info: dict[str, Any]) -> None:
         self._came.add(Role.CLOUD)
         n_unheard = self._n_unheard(info)
         self._statistics.receive(n_unheard)

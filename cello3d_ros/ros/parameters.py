@@ -24,7 +24,7 @@ _FIXED = {"cloud", "grid"}  # sections read once, by configure
 _FIXED_SETTINGS = {
     *(MODEL, AUTOSTART),
     *(T_BASE_SENSOR, "node.odometry_buffer_s", "node.seed"),
-    *("node.pairing", "node.registration", "node.use_tf", "node.publish_tf"),
+    *("node.pairing", "node.registration", "node.use_tf", "node.publish_tf", "node.points_type"),
 }
 _ELSEWHERE = {"sampling", "training", "qos_overrides"}  # read by the tools, and by ROS
 _INT64 = 2**63 - 1

@@ -10,10 +10,12 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 
+from cello3d_ros.clouds.livox import read_livox
 from cello3d_ros.clouds.pointcloud2 import read_points
 from cello3d_ros.config import Config
 from cello3d_ros.covariance.model import Model
@@ -28,6 +30,7 @@ from cello3d_ros.tracking.odometry import PoseSource
 from cello3d_ros.tracking.tracker import Answer, Tracker
 
 MAX_CLOUD_BYTES = 64 * 1024**2  # of a message on points: work takes up to 30 times its size
+_LIVOX_BYTES = 20  # of a point
 MAX_MAP_BYTES = 1024**3  # of one on reference_points, which is cropped before it is worked on
 
 
@@ -139,7 +142,7 @@ class Worker:
         self._locator.map_frame = frame_id
         self._tracker.take_map(stamp_ns, points, frame_id)
 
-    def hear_cloud(self, message: PointCloud2, now_ns: int, n_unheard: int = 0) -> None:
+    def hear_cloud(self, message: Any, now_ns: int, n_unheard: int = 0) -> None:
         """Let a cloud wait for its odometry, or drop it.
 
         n_unheard: clouds that came before it and were overwritten before they were heard.
@@ -211,7 +214,7 @@ class Worker:
         self._newest_cloud_ns = None
         self._tracker.reset(event)
 
-    def _admitted(self, stamp_ns: int, message: PointCloud2, now_ns: int) -> Array | Skip:
+    def _admitted(self, stamp_ns: int, message: Any, now_ns: int) -> Array | Skip:
         """Return the points of a cloud in its turn; a damaged one does not move the clock."""
         try:
             self._check_not_in_future(stamp_ns, now_ns)
@@ -238,8 +241,16 @@ class Worker:
             raise PoseError(f"the stamp is {ahead_s:.3f} s in the future")
 
 
-def _points(message: PointCloud2, max_bytes: int) -> Array:
-    """Return the points of a cloud of bounded size.  Raises CloudError."""
-    if len(message.data) > max_bytes:
-        raise CloudError(f"PointCloud2 holds {len(message.data)} bytes, more than {max_bytes}")
-    return read_points(message)
+def _points(message: Any, max_bytes: int) -> Array:
+    """Return the points of a PointCloud2, or Livox's CustomMsg, of bounded size.
+
+    Raises CloudError.
+    """
+    is_livox = not isinstance(message, PointCloud2)
+    n_bytes = _LIVOX_BYTES * len(message.points) if is_livox else len(message.data)
+    if n_bytes > max_bytes:
+        raise CloudError(f"the cloud holds {n_bytes} bytes, more than {max_bytes}")
+    if not is_livox:
+        return read_points(message)
+    found = read_livox(message)
+    return np.stack([found[axis] for axis in "xyz"], axis=1).astype(np.float64)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace as Info
 
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 import rclpy
 
-from cello3d_ros.config import Config
+from cello3d_ros.config import Config, NodeConfig
+from cello3d_ros.errors import ConfigError
 from cello3d_ros.geometry import se3
 from cello3d_ros.ros import messages
+from cello3d_ros.ros.inputs import topics
 from cello3d_ros.ros.node import CovarianceNode
 from cello3d_ros.tracking.warmup import room
 
@@ -128,3 +131,29 @@ def test_two_publishers_of_clouds_are_told(node, monkeypatch) -> None:
     monkeypatch.setattr(node, "get_publishers_info_by_topic", lambda _: found)
     hear(node, 0)
     assert "2 publishers send clouds on /points" in node._state().warnings[0]
+
+
+def test_livox_clouds_are_answered_and_damaged_ones_are_skipped(node) -> None:
+    """The message type itself comes with Livox's driver; the node reads its fields."""
+    for k in range(3):
+        T = se3.exp([0.1 * k, 0, 0, 0, 0, 0.02 * k])
+        points = se3.transform(se3.inverse(T), room(np.random.default_rng(k), 2000))
+        cloud = messages.cloud_to(S + k * S // 10, "lidar", points[:0])
+        cells = [
+            Info(x=x, y=y, z=z, reflectivity=7, tag=0, line=1, offset_time=i)
+            for i, (x, y, z) in enumerate([*points, (0.0, 0.0, 0.0)])
+        ]
+        node._on_pose(messages.odometry_to(S + k * S // 10, "odom", "lidar", T))
+        node._on_cloud(Info(header=cloud.header, points=cells), {})
+        node._work()
+    assert node._statistics.counts["answered"] == 2
+    cloud.header.stamp = messages.time_of(2 * S)
+    node._on_cloud(Info(header=cloud.header, points=[Info(x=1.0)]), {})
+    assert node._statistics.dropped["malformed"] == 1
+
+
+def test_without_livox_s_driver_its_clouds_are_refused_in_one_sentence() -> None:
+    if find_spec("livox_ros_driver2") is not None:
+        pytest.skip("livox_ros_driver2 is installed")
+    with pytest.raises(ConfigError, match="needs the package livox_ros_driver2"):
+        topics(NodeConfig(points_type="CustomMsg"))
