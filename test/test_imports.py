@@ -16,13 +16,8 @@ OF_ROSDEP = {
     "threadpoolctl": "python3-sklearn",
     "llvmlite": "python3-numba",
 }
-NO_KEY = {
-    "embreex",
-    "pyarrow",
-    "plotly",
-    "small_gicp",
-    "distributed",
-}  # and needed by few verbs only
+#: Needed by few verbs and inputs only; built from source or of pip.
+NO_KEY = {"pyarrow", "plotly", "small_gicp", "distributed", "embreex", "livox_ros_driver2"}
 
 SCRIPT = """
 import importlib, pkgutil, sys
@@ -57,7 +52,9 @@ def imported(folder: str) -> set[str]:
 
 
 def is_of_ros(name: str) -> bool:
-    return name in ("rclpy", "std_srvs") or name.endswith(("_msgs", "_interfaces"))
+    return name in ("rclpy", "std_srvs", "livox_ros_driver2") or name.endswith(
+        ("_msgs", "_interfaces")
+    )
 
 
 def keys_of_package_xml() -> set[str]:
