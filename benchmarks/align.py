@@ -6,6 +6,11 @@ Each recording is aligned from its clouds alone.  A line: kind, scanner, step; r
 error of a step by pairwise ICP (default pipeline, started near the truth) and by joint poses;
 their ratio; the error that the alignment expects; scans left out.  Lines that are in ``--out``
 already are not computed again.
+
+    python benchmarks/align.py --labels FOLDER [--kinds garden,hall] [--samples 200]
+
+samples a walk in each world about joint and about true poses, and judges the covariances of the
+one by those of the other: D2/6 above 1 says that joint poses make covariances too small.
 """
 
 from __future__ import annotations
@@ -20,10 +25,15 @@ from pathlib import Path
 import numpy as np
 
 from cello3d_ros.clouds.shape import prepare
-from cello3d_ros.config import Pipeline
+from cello3d_ros.config import Config, Pipeline, SamplingConfig
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.gaussian import kl
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.align import align
+from cello3d_ros.learning.aligned import AlignedPart
+from cello3d_ros.learning.dataset import open_dataset
+from cello3d_ros.learning.examples import load_examples
+from cello3d_ros.learning.sample import sample
 from cello3d_ros.recordings.poses import tum_line
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.registration.icp import register
@@ -36,34 +46,38 @@ KINDS = "rooms,hall,corridor,stairs,garden,wood"
 PERIOD_NS = 100_000_000
 
 
-class Frozen:
-    """A recording of a world from given poses; scans carry no pose."""
+class Bare:
+    """A recording of clouds without poses."""
 
     n_projected = 0
     has_odometry = False
 
-    def __init__(self, kind: str, scanner: str, seed: int, step_m: float, n_scans: int) -> None:
-        """Scan a world each ``step_m`` along its route, at one instant each."""
-        layout, way, _ = np.random.default_rng(seed).spawn(3)
-        truth = poses_along(build_world(kind, layout).route, step_m, n_scans, way)
-        with tempfile.NamedTemporaryFile("w", suffix=".tum") as path:
-            path.writelines(tum_line((k + 1) * PERIOD_NS, T) for k, T in enumerate(truth))
-            path.flush()
-            simulation = Simulation(kind, seed, n_scans, SCANNERS[scanner], Path(path.name))
-            scans = list(simulation)
-        self.name = f"{kind}-{scanner}-{step_m:g}-{seed}"
-        self.truth = np.array([scan.T_world_sensor for scan in scans])
-        self.clouds = [scan.points for scan in scans]
+    def __init__(self, name: str, scans: list[Scan]) -> None:
+        """Keep the scans."""
+        self.name, self.scans = name, scans
 
     def __len__(self) -> int:
-        return len(self.clouds)
+        return len(self.scans)
 
     def __iter__(self) -> Iterator[Scan]:
-        for k, points in enumerate(self.clouds):
-            yield Scan(stamp_ns=(k + 1) * PERIOD_NS, points=points)
+        return iter(self.scans)
 
     def track(self) -> None:
         """There are no poses."""
+
+
+def simulated(
+    kind: str, scanner: str, seed: int, step_m: float, n_scans: int
+) -> tuple[Bare, Array]:
+    """Return the scans of a world each ``step_m`` along its route, and their true poses."""
+    layout, way, _ = np.random.default_rng(seed).spawn(3)
+    truth = poses_along(build_world(kind, layout).route, step_m, n_scans, way)
+    with tempfile.NamedTemporaryFile("w", suffix=".tum") as path:
+        path.writelines(tum_line((k + 1) * PERIOD_NS, T) for k, T in enumerate(truth))
+        path.flush()
+        scans = list(Simulation(kind, seed, n_scans, SCANNERS[scanner], Path(path.name)))
+    bare = [Scan(stamp_ns=scan.stamp_ns, points=scan.points) for scan in scans]
+    return Bare(f"{kind}-{scanner}-{step_m:g}-{seed}", bare), truth
 
 
 def poses_along(route: Route, step_m: float, n: int, rng: np.random.Generator) -> Array:
@@ -76,12 +90,12 @@ def poses_along(route: Route, step_m: float, n: int, rng: np.random.Generator) -
     return np.array([se3.interpolate(T[k], T[k + 1], a) for k, a in zip(i, shares, strict=True)])
 
 
-def pairwise(recording: Frozen) -> Array:
+def pairwise(recording: Bare, truth: Array) -> Array:
     """Return the errors (n - 1, 6) of default ICP on each pair in a row."""
-    pipeline, truth = Pipeline(), recording.truth
+    pipeline = Pipeline()
     clouds = [
-        prepare(points, pipeline.cloud, np.random.default_rng(k))
-        for k, points in enumerate(recording.clouds)
+        prepare(scan.points, pipeline.cloud, np.random.default_rng(k))
+        for k, scan in enumerate(recording)
     ]
     found = []
     for k in range(1, len(clouds)):
@@ -107,12 +121,12 @@ def rms(xi: Array) -> list[float]:
 
 def measured(kind: str, scanner: str, step_m: float, n_scans: int, seed: int) -> dict[str, object]:
     """Return one line of the table."""
-    recording = Frozen(kind, scanner, seed, step_m, n_scans)
-    single = pairwise(recording)
+    recording, truth = simulated(kind, scanner, seed, step_m, n_scans)
+    single = pairwise(recording, truth)
     found = align(recording)
     kept = found.members()
     both = np.flatnonzero(np.diff(kept) == 1)
-    joint = errors(found.poses[kept], recording.truth[kept])[both]
+    joint = errors(found.poses[kept], truth[kept])[both]
     steps = zip(kept[:-1][both], kept[1:][both], strict=True)
     Y = np.array([found.step_covariance(int(i), int(j)) for i, j in steps])
     d2 = np.einsum("ni,nij,nj->n", joint, np.linalg.inv(Y), joint)
@@ -129,6 +143,40 @@ def measured(kind: str, scanner: str, step_m: float, n_scans: int, seed: int) ->
     }
 
 
+def labels(kind: str, folder: Path, n_samples: int, seed: int, n_scans: int) -> str:
+    """Return a line on the covariances about joint poses, judged by those about true ones."""
+    config = Config(sampling=SamplingConfig(n_samples=n_samples, max_gap=2))
+    exact = Simulation(kind, seed, n_scans)
+    bare = [Scan(stamp_ns=scan.stamp_ns, points=scan.points) for scan in exact]
+    found = align(Bare(exact.name, bare))
+    truth, joint = folder / f"{exact.name}.exact", folder / f"{exact.name}.joint"
+    sample([exact], truth, config, 2)
+    sample([AlignedPart(Bare(exact.name, bare), found)], joint, config, 2)
+    if found.reasons:
+        return f"{kind:9} scans left out: {found.reasons}"
+    datasets = [open_dataset(path) for path in (truth, joint)]
+    both = {
+        key
+        for key in datasets[0].pair_keys()
+        if all(data.read(*key).accepted for data in datasets)
+    }
+    Y_true, Y_joint = (
+        load_examples([data], {exact.name}).covariances[
+            [key in both for key in data.pair_keys() if data.read(*key).accepted]
+        ]
+        for data in datasets
+    )
+    fit = np.trace(np.linalg.solve(Y_joint, Y_true), axis1=1, axis2=2) / 6.0
+    size = np.sqrt(
+        np.mean([np.trace(Y[:, :3, :3], axis1=1, axis2=2) for Y in (Y_joint, Y_true)], 1)
+    )
+    return (
+        f"{kind:9} {len(both)} pairs, sigma {1e3 * size[0]:.2f} mm (exact {1e3 * size[1]:.2f}), "
+        f"KL median {np.median(kl(Y_true, Y_joint)):.2f}, D2/6 median {np.median(fit):.2f} "
+        f"mean {fit.mean():.2f}"
+    )
+
+
 def main() -> None:
     """Measure what is missing and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -138,7 +186,15 @@ def main() -> None:
     parser.add_argument("--seeds", default="11,12")
     parser.add_argument("--scans", type=int, default=12)
     parser.add_argument("--out", type=Path, help="JSON lines, to write and to go on from")
+    parser.add_argument("--labels", type=Path, help="folder for datasets: compare labels instead")
+    parser.add_argument("--samples", type=int, default=200)
     arguments = parser.parse_args()
+    if arguments.labels:
+        for kind in arguments.kinds.split(","):
+            for seed in map(int, arguments.seeds.split(",")):
+                n = arguments.scans
+                print(labels(kind, arguments.labels, arguments.samples, seed, n), flush=True)
+        return
     done = {}
     if arguments.out and arguments.out.exists():
         rows = map(json.loads, arguments.out.read_text().splitlines())

@@ -16,18 +16,19 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.atomic import new_file
-from cello3d_ros.clouds.shape import local_shape
+from cello3d_ros.clouds.shape import Cloud, local_shape
 from cello3d_ros.config import Pipeline
 from cello3d_ros.errors import CloudError, RecordingError
 from cello3d_ros.geometry.pose_track import PoseTrack
-from cello3d_ros.geometry.se3 import Array, adjoint, inverse, log
-from cello3d_ros.learning.align_chain import Chain, Link, Placed, build_chain
+from cello3d_ros.geometry.se3 import Array, adjoint, exp, inverse, log
+from cello3d_ros.learning.align_chain import Chain, Placed, build_chain
 from cello3d_ros.learning.align_scans import ScanStore, ShapedScan, filtered_scan
 from cello3d_ros.learning.align_sweeps import (
     N_BEFORE,
@@ -39,9 +40,10 @@ from cello3d_ros.learning.align_sweeps import (
 )
 from cello3d_ros.learning.identity import fingerprint
 from cello3d_ros.recordings.recording import Recording, Scan
+from cello3d_ros.registration.icp import register
 
 MAX_SWEEPS = 8
-_FEWEST_SWEEPS = 3
+_FEWEST_SWEEPS = 4
 _TOLERANCE_M = 1e-3  # median change of the steps in a sweep that ends them
 _KEYFRAME_M, _KEYFRAME_RAD = 0.05, 0.02  # motion that makes a new keyframe
 _SAVE_S = 20.0
@@ -51,9 +53,9 @@ _FLOOR_M, _FLOOR_RAD = 1e-4, 1e-5
 _OUTLIER = 8.0  # times the usual difference of half-sets: a scan that does not hold,
 _OUTLIER_M, _OUTLIER_RAD = 0.03, 0.015  # from these on
 _STATE = "state.npz"
-_VERSION = 1  # of the state
+_VERSION = 2  # of the state
 _FACTS = ("sweep", "position", "is_last", "is_done", "moves_m", "compensated")
-_ARRAYS = ("stamps_ns", "keyframes", "held", "moved", "halves", "first_poses")
+_ARRAYS = ("stamps_ns", "keyframes", "held", "moved", "halves", "first_poses", "pairs")
 
 Progress = Callable[[int, int], None]  # scans visited so far, and in all as far as known
 
@@ -66,7 +68,7 @@ class Alignment:
     covariances: (n, 6, 6), of each pose beside its neighbours, (u, omega), sensor side, as
     ``T_true = T exp(xi)``; zeros where the scan is left out.  part: (n,), scans of one number
     have poses in one frame; 0 is the longest, -1 is left out.  reasons: why a scan is left out.
-    pairwise: (m, 6), of the links of the chain: pairwise registration minus joint poses.
+    pairwise: (m, 6), of scans in a row: registration of the two alone, from the joint poses.
     moves_m: median change of the steps in each sweep.  compensated: whether the motion within
     scans was undone.
     """
@@ -125,6 +127,7 @@ class _State:
     moved: Array
     halves: Array
     first_poses: Array
+    pairs: Array
     sweep: int = 1
     position: int = 0
     is_last: bool = False
@@ -217,6 +220,7 @@ def _begin(
         moved=np.zeros((n, 6)),
         halves=np.zeros((n, 6)),
         first_poses=chain.poses.copy(),
+        pairs=np.zeros((n, 6)),
         compensated=compensated,
     )
 
@@ -265,7 +269,9 @@ def _sweep(
     members = np.flatnonzero(state.chain.part >= 0)
     n = len(state.chain.part)
     saved = time.monotonic()
-    while not state.is_done:
+    if state.is_done:
+        return
+    while True:
         order = members if state.sweep % 2 else members[::-1]
         done = set(order[: state.position].tolist())
         for k in order[state.position :].tolist():
@@ -283,6 +289,7 @@ def _sweep(
         state.sweep, state.position = state.sweep + 1, 0
         state.is_last = rests or state.sweep == MAX_SWEEPS
         _save(folder, key, state)
+    _register_pairs(state, store, pipeline, seed)
     state.is_done = True
     _save(folder, key, state)
     store.clear()
@@ -303,44 +310,74 @@ def _visit(
     seed: int,
     n_threads: int,
 ) -> None:
+    """Register a scan to its neighbours.
+
+    The first sweep looks back only and takes the scans after it along: the drift of the chain is
+    gone before scans on both sides hold a scan in place.
+    """
     chain, sweep = state.chain, state.sweep
+    is_first = sweep == 1
     members = np.flatnonzero((chain.part == chain.part[k]) & state.held)
     keyframes = members[state.keyframes[members]]
+    if is_first:
+        keyframes = keyframes[keyframes < k]
     around = neighbors_of(k, keyframes[keyframes != k]).tolist()
     neighbors = {j: store.shaped(j, sweep if j in done else sweep - 1) for j in around}
     own = own_points(store, k, motion_of(k, chain.poses, state.stamps_ns, members))
+    if is_first and not neighbors:
+        store.add_shaped(k, sweep, store.shaped(k, sweep - 1))
+        return
     found = visit(k, chain.poses, neighbors, own, pipeline, seed, state.is_last, n_threads)
+    if is_first:
+        after = members[members > k]
+        moved = exp(log(found.T @ inverse(chain.poses[k])))  # a rotation to rounding
+        chain.poses[after] = moved @ chain.poses[after]
     chain.poses[k] = found.T
-    state.held[k] = found.holds
+    state.held[k] = found.holds or is_first
     state.moved[k] = found.moved if found.holds else 0.0
     state.halves[k] = found.halves
     store.add_shaped(k, sweep, found.shaped)
 
 
+def _register_pairs(state: _State, store: ScanStore, pipeline: Pipeline, seed: int) -> None:
+    """Register each scan to the one before it alone, from the joint poses."""
+    chain = state.chain
+    for p in range(int(chain.part.max()) + 1):
+        members = np.flatnonzero((chain.part == p) & state.held)
+        clouds: dict[int, Cloud] = {}
+        for i, j in pairwise(members.tolist()):
+            for k in (i, j):
+                if k not in clouds:
+                    scan = store.shaped(k, state.sweep)
+                    clouds[k] = cloud_of(scan.points, scan.normals)
+            T = inverse(chain.poses[i]) @ chain.poses[j]
+            rng = np.random.default_rng([seed, j, i])
+            found = register(clouds[j], clouds.pop(i), T, pipeline.icp, rng)
+            state.pairs[j] = log(inverse(T) @ found.T_ref_read)
+
+
 def _finished(name: str, state: _State) -> Alignment:
     chain, reasons = state.chain, dict(state.reasons)
     part = chain.part.copy()
-    part[~state.held] = -1
-    for k in np.flatnonzero((chain.part >= 0) & ~state.held):
+    for k in np.flatnonzero((part >= 0) & ~state.held):
+        part[k] = -1
         reasons[int(k)] = "does not hold to its neighbours"
     for k in np.flatnonzero((part >= 0) & _torn(state.halves, part >= 0)):
         part[k] = -1
-        reasons[int(k)] = (
-            f"halves of its neighbours put it {np.linalg.norm(state.halves[k, :3]):.3f} m and "
-            f"{np.linalg.norm(state.halves[k, 3:]):.3f} rad apart"
-        )
+        reasons[int(k)] = f"halves of its neighbours put it {_words(state.halves[k])} apart"
+    cut = _torn(state.pairs, part >= 0)
+    part = _split(part, cut)
+    for k in np.flatnonzero((part < 0) & (chain.part >= 0)):
+        reasons.setdefault(int(k), "too few scans hold together around it")
     poses, covariances = chain.poses.copy(), np.zeros((len(part), 6, 6))
-    for p in np.unique(part[part >= 0]):
+    for p in range(int(part.max(initial=-1)) + 1):
         members = np.flatnonzero(part == p)
         covariances[members] = _spread(state.halves[members])
-        poses[members] = (
-            state.first_poses[members[0]] @ inverse(poses[members[0]]) @ poses[members]
-        )
-    pairwise = [
-        log(inverse(inverse(chain.poses[link.reference]) @ chain.poses[k]) @ link.T_ref_read)
-        for k, link in chain.links.items()
-        if part[k] >= 0 and part[link.reference] >= 0
-    ]
+        first = state.first_poses[members[0]] @ inverse(poses[members[0]])
+        poses[members] = first @ poses[members]
+    if not (part >= 0).any():
+        raise RecordingError(_nothing(name, len(part), reasons))
+    pairs = state.pairs[(part >= 0) & state.pairs.any(axis=1) & ~cut]
     return Alignment(
         name=name,
         stamps_ns=state.stamps_ns,
@@ -348,7 +385,7 @@ def _finished(name: str, state: _State) -> Alignment:
         covariances=covariances,
         part=part,
         reasons=dict(sorted(reasons.items())),
-        pairwise=np.array(pairwise).reshape(-1, 6),
+        pairwise=pairs,
         moves_m=tuple(state.moves_m),
         n_contradicted=chain.n_contradicted,
         n_searched=chain.n_searched,
@@ -356,11 +393,30 @@ def _finished(name: str, state: _State) -> Alignment:
     )
 
 
-def _torn(halves: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which scans the halves of their neighbours put in places far apart."""
-    torn = np.zeros(len(halves), np.bool_)
+def _split(part: NDArray[np.int64], cut: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return parts, cut before some scans, of at least 3 scans, numbered from the longest."""
+    pieces = [
+        piece
+        for p in range(int(part.max(initial=-1)) + 1)
+        for members in [np.flatnonzero(part == p)]
+        for piece in np.split(members, np.flatnonzero(cut[members]))
+        if len(piece) >= 3
+    ]
+    found = np.full(len(part), -1)
+    for p, piece in enumerate(sorted(pieces, key=lambda piece: -len(piece))):
+        found[piece] = p
+    return found
+
+
+def _words(xi: Array) -> str:
+    return f"{np.linalg.norm(xi[:3]):.3f} m and {np.linalg.norm(xi[3:]):.3f} rad"
+
+
+def _torn(xi: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which differences (n, 6) are large, and beyond what is usual in the recording."""
+    torn = np.zeros(len(xi), np.bool_)
     for columns, least in ((slice(0, 3), _OUTLIER_M), (slice(3, 6), _OUTLIER_RAD)):
-        apart = np.linalg.norm(halves[:, columns], axis=1)
+        apart = np.linalg.norm(xi[:, columns], axis=1)
         torn |= apart > max(least, _OUTLIER * float(np.median(apart[known])))
     return torn
 
@@ -391,7 +447,6 @@ def _key(recording: Recording, pipeline: Pipeline, start: PoseTrack | None, seed
 
 def _save(folder: Path, key: str, state: _State) -> None:
     chain = state.chain
-    links = sorted(chain.links.items())
     facts = {
         "key": key,
         "reasons": {str(k): reason for k, reason in state.reasons.items()},
@@ -405,9 +460,6 @@ def _save(folder: Path, key: str, state: _State) -> None:
             facts=np.frombuffer(json.dumps(facts).encode(), np.uint8),
             poses=chain.poses,
             part=chain.part,
-            link_scans=np.array([[k, link.reference] for k, link in links]).reshape(-1, 2),
-            link_poses=np.array([link.T_ref_read for _, link in links]).reshape(-1, 4, 4),
-            link_shares=np.array([link.share for _, link in links]),
             **{name: getattr(state, name) for name in _ARRAYS},
         )
 
@@ -428,11 +480,9 @@ def _load(folder: Path, key: str) -> _State | None:
             raise RecordingError(
                 f"{folder} holds the alignment of another recording or start; remove it"
             )
-        links = zip(arrays["link_scans"], arrays["link_poses"], arrays["link_shares"], strict=True)
         chain = Chain(
             arrays["poses"],
             arrays["part"],
-            {int(ij[0]): Link(int(ij[1]), T, float(share)) for ij, T, share in links},
             facts["n_contradicted"],
             facts["n_searched"],
         )

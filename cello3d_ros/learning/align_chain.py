@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -48,13 +48,12 @@ class Chain:
     """First poses of n scans.
 
     poses: (n, 4, 4), T_part_sensor.  part: (n,) number of the part, -1 where a scan holds to none.
-    links: scan -> the registration that its pose comes from.  n_contradicted: start poses that the
+    n_contradicted: start poses that the
     clouds contradict; n_searched: scans that needed a search.
     """
 
     poses: Array
     part: NDArray[np.int64]
-    links: dict[int, Link] = field(default_factory=dict)
     n_contradicted: int = 0
     n_searched: int = 0
 
@@ -83,7 +82,6 @@ def build_chain(scans: Iterator[Placed], n_scans: int, icp: IcpConfig, seed: int
             if link.share >= MIN_SHARE:
                 chain.poses[scan.k] = chain.poses[link.reference] @ link.T_ref_read
                 chain.part[scan.k] = p
-                chain.links[scan.k] = link
                 parts[p] = [parts[p][-1], scan]
                 sizes[p] += 1
                 break
@@ -103,7 +101,6 @@ def _without_short_parts(chain: Chain, sizes: Sequence[int]) -> Chain:
     long = sorted((p for p, size in enumerate(sizes) if size >= 3), key=lambda p: -sizes[p])
     number = {p: k for k, p in enumerate(long)}
     chain.part = np.array([number.get(int(p), -1) for p in chain.part])
-    chain.links = {k: link for k, link in chain.links.items() if chain.part[k] >= 0}
     return chain
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cello3d_ros.clouds.neighbors import KdTree, build_tree, nearest
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig, Pipeline
-from cello3d_ros.geometry.se3 import Array, inverse, log, transform
+from cello3d_ros.geometry.se3 import Array, exp, inverse, log, transform
 from cello3d_ros.learning.align_chain import MIN_SHARE, share_on_surfaces
 from cello3d_ros.learning.align_scans import ScanStore, ShapedScan, undistorted
 from cello3d_ros.registration.icp import register
@@ -93,7 +93,7 @@ def visit(
         and float(np.linalg.norm(moved[:3])) < _MAX_MOVE_M
         and float(np.linalg.norm(moved[3:])) < _MAX_MOVE_RAD
     )
-    step = found.T_ref_read if holds else np.eye(4)
+    step = exp(moved) if holds else np.eye(4)
     halves = np.zeros(6)
     if wants_halves and holds and len(neighbors) >= 2:
         halves = _halves(k, poses, neighbors, reading, step, icp, seed)
