@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import statistics
 from collections import deque
 from collections.abc import Callable
@@ -17,6 +18,7 @@ JUMP_NS = (
 
 _N_WAITING = 64  # clouds that wait
 _N_POINTS = 8_000_000  # points of all of them: 200 MB
+_BACKLOG = 3  # clouds ready to be worked on, from which on the newest is taken
 _N_CLOUDS = 10  # whose times of arrival say how often clouds come
 _N_WORKS = 5  # pieces of work, most of which are too long under overload
 
@@ -57,10 +59,10 @@ def stamp_order(stamp_ns: int, newest_ns: int | None) -> str:
 class Intake:
     """Clouds that wait for their odometry, worked on in their order.
 
-    Only where the work takes longer than clouds take to come is the newest taken first and those
-    before it dropped.  A bounded number waits, with a bounded number of points; beyond that the
-    newest takes the place of the one before it, so that odometry that is always late starves
-    nobody.
+    Only where the work takes longer than clouds take to come, and three are ready, is the newest
+    taken first and those before it dropped.  A bounded number waits, with a bounded number of
+    points; beyond that the newest takes the place of the one before it, so that odometry that is
+    always late starves nobody.
     """
 
     def __init__(
@@ -129,7 +131,7 @@ class Intake:
         It is the oldest such cloud, or the newest under overload; what is older is dropped.
         """
         skips: list[Skip] = []
-        is_overloaded = self.is_overloaded
+        is_overloaded = self.is_overloaded and self._n_ready() >= _BACKLOG
         for job in self._waiting[::-1] if is_overloaded else self._waiting[:]:
             try:
                 job.place = self._place(job)
@@ -167,6 +169,15 @@ class Intake:
 
     def _place(self, job: Job) -> Place:
         return self._locate(job.stamp_ns, job.frame_id, job.waited_s >= self.timeout_s)
+
+    def _n_ready(self) -> int:
+        """Return how many clouds wait with all that they need."""
+        n = 0
+        for job in self._waiting:
+            with contextlib.suppress(PoseError):
+                self._place(job)
+                n += 1
+        return n
 
     def _passed_over(self, job: Job, is_overloaded: bool) -> Skip:
         if not is_overloaded:  # a later cloud has what this one lacks

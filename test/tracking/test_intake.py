@@ -70,16 +70,29 @@ def test_clouds_are_taken_in_order_while_the_work_is_fast() -> None:
     assert [(job.stamp_ns // S, skips) for job, skips in taken] == [(1, []), (2, []), (3, [])]
 
 
-def test_under_overload_the_newest_cloud_wins_and_the_older_is_counted() -> None:
-    intake = intake_of(odometry(S, 2 * S, 3 * S))
-    for k in (1, 2):
+def overloaded(n_clouds: int) -> Intake:
+    """An intake with some clouds that are ready, and work that takes three times too long."""
+    intake = intake_of(odometry(*(k * S for k in range(1, 7))))
+    for k in range(1, n_clouds + 1):
         intake.offer(job(k * S, received_s=0.1 * k))
     for _ in range(3):
         intake.note_work(0.3)
-    taken, skips = intake.take()
+    return intake
+
+
+def test_under_overload_the_newest_cloud_wins_and_the_older_are_counted() -> None:
+    taken, skips = overloaded(3).take()
     assert taken is not None
-    assert taken.stamp_ns == 2 * S
-    assert [(skip.stamp_ns, skip.reason) for skip in skips] == [(S, "superseded")]
+    assert taken.stamp_ns == 3 * S
+    assert [(skip.stamp_ns // S, skip.reason) for skip in skips] == [
+        *((k, "superseded") for k in (1, 2))
+    ]
+
+
+def test_two_that_are_ready_are_both_worked_on_even_under_overload() -> None:
+    intake = overloaded(2)
+    assert intake.is_overloaded
+    assert [intake.take()[0].stamp_ns // S for _ in range(2)] == [1, 2]
 
 
 def test_clouds_that_were_never_heard_count_for_the_load() -> None:
