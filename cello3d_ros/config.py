@@ -52,6 +52,13 @@ class CloudConfig(Section):
     voxel_m: float = _setting(0.2, "side of the cubes in which density is bounded", 1e-3)
     max_points_per_voxel: int = _setting(4, "points kept in one cube, drawn at random", 1)
     n_neighbors: int = _setting(20, "neighbours of a normal and its features", 3, 64)
+    min_spread: float = _setting(
+        0.4,
+        "least second spread of the neighbours, against the first, that makes a plane: else two "
+        "and three times as many are tried; 0 takes any (the paper)",
+        0.0,
+        1.0,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

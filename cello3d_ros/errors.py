@@ -34,6 +34,12 @@ class NotConvergedError(RegistrationError):
     reason = "not_converged"
 
 
+class FreeDirectionError(RegistrationError):
+    """No plane of the overlap holds some direction: any answer would be made up."""
+
+    reason = "free_direction"
+
+
 class NoOverlapError(RegistrationError):
     """Two registered clouds share too little geometry."""
 

@@ -38,7 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Cello3dError as error:
         print(f"cello3d: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        if isinstance(error, SystemError) and not isinstance(error.__cause__, KeyboardInterrupt):
+            raise  # else: Ctrl-C while a compiled function took its arguments
         print("cello3d: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output left, as `head` does

@@ -8,6 +8,7 @@ that k of them do not exceed (``gathering`` collects them).
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cello3d_ros.clouds.gathering import FAR2, LEAST2, gather, make_room
 from cello3d_ros.clouds.lanes import count_row, least_above
@@ -20,12 +21,20 @@ _TRIES = 12  # thresholds tried before that
 
 
 @kernel()
-def covariances(leaves: Leaves, n: int, k: int, first: int, stop: int, out: Array) -> None:
-    """Fill out[g - first], (6, 16), for the points of leaf g: xx, yy, zz, xy, xz, yz.
+def covariances(
+    leaves: Leaves,
+    n: int,
+    k: int,
+    first: int,
+    stop: int,
+    wanted: NDArray[np.bool_],
+    out: Array,
+) -> None:
+    """Fill out[g - first], (6, 16), for the wanted points of leaf g: xx, yy, zz, xy, xz, yz.
 
     n: points of the tree; k: neighbours, the point itself among them; all n where there are
-    fewer.  Of equally far points the first in order are taken.  Lanes beyond the last point are
-    zero.
+    fewer; wanted: (n,).  Of equally far points the first in order are taken.  Lanes of points
+    that are not wanted are zero.
     """
     points = leaves.points
     k = min(k, n)
@@ -43,6 +52,9 @@ def covariances(leaves: Leaves, n: int, k: int, first: int, stop: int, out: Arra
         far2, most2, n_near = min(1.5 * most2, FAR2), LEAST2, -1
         out[g - first, :, size:] = 0.0
         for lane in range(size):
+            if not wanted[WIDTH * g + lane]:
+                out[g - first, :, lane] = 0.0
+                continue
             x, y, z = points[g, 0, lane], points[g, 1, lane], points[g, 2, lane]
             n_rows, found, bound2, far2, n_near = gather(
                 leaves, box, x, y, z, k, 1.3 * guess2, far2, FAR2, n_near, room

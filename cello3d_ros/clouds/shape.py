@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cello3d_ros.clouds.covariances import covariances
 from cello3d_ros.clouds.filters import crop_range, limit_density
@@ -18,14 +19,16 @@ from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.threads import in_threads
 
 _CHUNK = 256  # leaves of one task
+_WIDENINGS = (1, 2, 3)  # times the neighbours that are tried until they are not on a line
 
 
 class Cloud(NamedTuple):
     """A filtered scan with its local shape, computed once and used in both roles.
 
     points: (N, 3), metres, sensor frame, in the order of the tree, so that neighbours in space
-    are near in memory; normals: (N, 3), unit, sign arbitrary; planarity, cylindricality: (N,), in
-    [0, 1]; these three are empty before ``with_shape``; tree: k-d tree of the points.
+    are near in memory; normals: (N, 3), unit, sign arbitrary, 0 where there is no plane;
+    planarity, cylindricality: (N,), in [0, 1]; these three are empty before ``with_shape``; tree:
+    k-d tree of the points.
     """
 
     points: Array
@@ -66,7 +69,7 @@ def with_shape(cloud: Cloud, config: CloudConfig, n_threads: int = 1) -> Cloud:
     """Do the second part of ``prepare``, unless it has been done."""
     if has_shape(cloud):
         return cloud
-    shape = local_shape(cloud.tree, config.n_neighbors, n_threads)
+    shape = local_shape(cloud.tree, config.n_neighbors, n_threads, config.min_spread)
     return Cloud(cloud.points, *shape, cloud.tree)
 
 
@@ -75,31 +78,49 @@ def has_shape(cloud: Cloud) -> bool:
     return len(cloud.normals) == len(cloud.points)
 
 
-def local_shape(tree: KdTree, k: int, n_threads: int = 1) -> tuple[Array, Array, Array]:
+def local_shape(
+    tree: KdTree, k: int, n_threads: int = 1, min_spread: float = 0.0
+) -> tuple[Array, Array, Array]:
     """Return normals (N, 3), planarity (N,) and cylindricality (N,) of the points of a tree.
 
     Of the covariance of the k nearest points (the point itself among them), s1 >= s2 >= s3 being
     the square roots of its eigenvalues: the normal is the direction of s3, planarity is
     (s2 - s3) / s1 and cylindricality (s1 - s2) / s1; both are 0 where all neighbours coincide.
     Source: Demantke et al. 2011.
+
+    Points on a line have no plane: where s2 / s1 is below ``min_spread``, as in one ring of a
+    lidar, 2 k and 3 k neighbours are tried, and the normal is 0 if they are on a line as well.
     """
-    n, n_leaves = len(tree.points), len(tree.lanes)
+    n = len(tree.points)
     normals, planarity, cylindricality = np.empty((n, 3)), np.empty(n), np.empty(n)
+    wanted = np.ones(n, np.bool_)
 
-    def task(first: int) -> None:
-        stop = min(first + _CHUNK, n_leaves)
-        near = np.empty((stop - first, 6, WIDTH))
-        covariances(tree.leaves, n, k, first, stop, near)
+    def task(first: int, k: int) -> None:
+        stop = min(first + _CHUNK, len(tree.lanes))
         part = slice(WIDTH * first, WIDTH * stop)
-        _shape(near, normals[part], planarity[part], cylindricality[part])
+        if not wanted[part].any():
+            return
+        near = np.empty((stop - first, 6, WIDTH))
+        covariances(tree.leaves, n, k, first, stop, wanted, near)
+        _shape(near, wanted[part], normals[part], planarity[part], cylindricality[part])
 
-    in_threads(task, list(range(0, n_leaves, _CHUNK)), n_threads)
+    for factor in _WIDENINGS if min_spread > 0.0 else _WIDENINGS[:1]:
+        starts = range(0, len(tree.lanes), _CHUNK)
+        in_threads(lambda first, k=factor * k: task(first, k), starts, n_threads)
+        wanted &= cylindricality > 1.0 - min_spread
+    normals[wanted & (min_spread > 0.0)] = 0.0
     return normals, planarity, cylindricality
 
 
 @kernel(error_model="numpy")
-def _shape(near: Array, normals: Array, planarity: Array, cylindricality: Array) -> None:
-    """Fill the shape of each covariance of near, (L, 6, 16).
+def _shape(
+    near: Array,
+    wanted: NDArray[np.bool_],
+    normals: Array,
+    planarity: Array,
+    cylindricality: Array,
+) -> None:
+    """Fill the shape of each covariance of near, (L, 6, 16), that is wanted.
 
     Cyclic Jacobi rotations of sixteen matrices at a time, until what is left off the diagonal
     moves nothing in double precision: it enters the eigenvalues squared.  w holds the rows xx, yy,
@@ -108,6 +129,8 @@ def _shape(near: Array, normals: Array, planarity: Array, cylindricality: Array)
     """
     w = np.empty(16 * 16)
     for g in range(len(near)):
+        if not wanted[WIDTH * g : WIDTH * g + WIDTH].any():
+            continue
         w[: 6 * 16] = near[g].ravel()
         w[6 * 16 : 15 * 16] = 0.0
         w[6 * 16 : 7 * 16] = w[10 * 16 : 11 * 16] = w[14 * 16 : 15 * 16] = 1.0
@@ -121,7 +144,7 @@ def _shape(near: Array, normals: Array, planarity: Array, cylindricality: Array)
             if n_left == 0:
                 break
             _sweep(w)
-        _write(w, WIDTH * g, normals, planarity, cylindricality)
+        _write(w, WIDTH * g, wanted, normals, planarity, cylindricality)
 
 
 @kernel(error_model="numpy")
@@ -171,10 +194,19 @@ def _rotation(pp: float, qq: float, pq: float, live: bool) -> tuple[float, float
 
 
 @kernel(error_model="numpy")
-def _write(w: Array, first: int, normals: Array, planarity: Array, cylindricality: Array) -> None:
-    """Write the shapes of the diagonal matrices of w, from point ``first`` on."""
+def _write(
+    w: Array,
+    first: int,
+    wanted: NDArray[np.bool_],
+    normals: Array,
+    planarity: Array,
+    cylindricality: Array,
+) -> None:
+    """Write the wanted shapes of the diagonal matrices of w, from point ``first`` on."""
     for lane in range(min(16, len(normals) - first)):
         i = first + lane
+        if not wanted[i]:
+            continue
         xx, yy, zz = w[lane], w[16 + lane], w[32 + lane]
         axis = 6
         if yy < xx:

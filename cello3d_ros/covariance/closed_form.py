@@ -12,10 +12,14 @@ from cello3d_ros.clouds.neighbors import Indices
 from cello3d_ros.clouds.shape import Cloud, has_shape
 from cello3d_ros.compiled import kernel
 from cello3d_ros.config import IcpConfig
-from cello3d_ros.errors import RegistrationError
+from cello3d_ros.errors import FreeDirectionError
 from cello3d_ros.geometry.gaussian import symmetrized
 from cello3d_ros.geometry.se3 import Array, hat, transform
 from cello3d_ros.registration.overlap import Overlap
+
+_N_NEIGHBORS = 20  # of a normal
+_HELD = 2.0  # least information of a direction against what errors of normals make of it
+_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 class ClosedForm(NamedTuple):
@@ -46,27 +50,31 @@ def closed_form(
 
     overlap: the clouds' associations.  H is the point-to-plane normal matrix of those that
     ICP's rules keep.  ICP draws n_reading_points of the reading's N points, so both are scaled by
-    N / n_reading_points.  Raises RegistrationError when the geometry leaves a direction free.
+    N / n_reading_points.  Raises FreeDirectionError when the geometry leaves a direction free.
     """
     assert has_shape(reference)
     limit2 = _trim_limit(overlap.distances2, config)
+    weights = np.empty(len(reading.points))
     H, G, sum2, n = _normal_matrices(
         reading.points,
         transform(T_ref_read, reading.points),
         reference.points,
         reference.normals,
+        _normal_variances(reference),
         np.ascontiguousarray(T_ref_read[:3, :3]),
         overlap.distances2,
         overlap.indices,
         limit2,
+        weights,
     )
+    _check_that_planes_hold(H, _tilted(reading.points, weights))
     inverse_H = _inverse(H)
     drawn = _drawn(reading, config)
     return ClosedForm(
         drawn * inverse_H,
         symmetrized(drawn * inverse_H @ G @ inverse_H),
         np.sqrt(limit2),
-        np.sqrt(sum2 / n),
+        np.sqrt(sum2 / max(n, 1)),
         n,
     )
 
@@ -163,14 +171,60 @@ def _drawn(reading: Cloud, config: IcpConfig) -> float:
 
 
 def _inverse(H: Array) -> Array:
-    """Return ``H^-1``.  Raises RegistrationError if it is singular, whatever the units."""
+    """Return ``H^-1``.  Raises FreeDirectionError if it is singular, whatever the units."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(H * np.outer(scale, scale))
     if not eigenvalues[0] > 1e-10 * eigenvalues[-1]:
-        raise RegistrationError(
+        raise FreeDirectionError(
             "the overlap leaves a direction free: the normal equations of ICP are singular"
         )
     return np.asarray(np.outer(scale, scale) * ((vectors / eigenvalues) @ vectors.T))
+
+
+def _normal_variances(cloud: Cloud) -> Array:
+    """Return the variance of each normal about either axis of its plane, rad^2.  (N,).
+
+    That of a line's slope: ``s3^2`` of the points about it over ``k s2^2``.
+    """
+    spread = np.maximum(1.0 - cloud.cylindricality, 1e-9)  # s2 / s1
+    return np.asarray((1.0 - cloud.planarity / spread) ** 2 / _N_NEIGHBORS)
+
+
+def _tilted(points: Array, weights: Array) -> Array:
+    """Return the part of H that errors of the normals alone would make.  (6, 6).
+
+    ``sum w A A^T``, A = [I; hat(p)], w being the variances of the normals at one point.
+    """
+    W, s = weights.sum(), points.T @ weights
+    S = (points * weights[:, None]).T @ points
+    N = np.zeros((6, 6))
+    N[:3, :3] = W * np.eye(3)
+    N[3:, :3], N[:3, 3:] = hat(s), -hat(s)
+    N[3:, 3:] = np.trace(S) * np.eye(3) - S
+    return N
+
+
+def _check_that_planes_hold(H: Array, N: Array) -> None:
+    """Raise FreeDirectionError where H has little more than errors of the normals explain.
+
+    H, N: (6, 6), the normal matrix and the part of it that such errors would make.  A direction v
+    is free where ``v^T H v < _HELD v^T N v``: about ``N / H`` of a motion along it is not seen.
+    """
+    arm = np.sqrt(np.trace(H[3:, 3:]) / max(np.trace(H[:3, :3]), 1e-300))  # radians to metres
+    unit = np.array([1.0, 1.0, 1.0, arm, arm, arm]) if arm > 0.0 else np.ones(6)
+    per_metre = 1.0 / np.outer(unit, unit)
+    H, N = H * per_metre, N * per_metre
+    least = 1e-12 * np.trace(H + N) + 1e-300
+    root = np.linalg.inv(np.linalg.cholesky(N + least * np.eye(6)))
+    held, vectors = np.linalg.eigh(root @ H @ root.T)
+    free = held < _HELD
+    if free.any():
+        directions, _ = np.linalg.qr(root.T @ vectors[:, free])
+        shares = (directions**2).sum(axis=1)
+        named = [name for name, share in zip(_AXES, shares) if share > 0.25]
+        raise FreeDirectionError(
+            f"no plane of the overlap holds {', '.join(named)} of the sensor: free here"
+        )
 
 
 @kernel()
@@ -179,14 +233,17 @@ def _normal_matrices(
     moved: Array,
     points: Array,
     normals: Array,
+    variances: Array,
     R: Array,
     distances2: Array,
     indices: Indices,
     limit: float,
+    weights: Array,
 ) -> tuple[Array, Array, float, int]:
     """Return H = sum J^T J and G = sum_i g_i g_i^T, g_i = sum J^T r over one point's neighbours.
 
-    The third is sum r^2, the fourth how many associations all of these are sums of.
+    The third is sum r^2, the fourth how many associations all of these are sums of.  weights is
+    filled with the sum of the normals' variances at each reading point.
 
     The residual of ``T exp(xi) p`` has the Jacobian ``[m, p x m]``, m = R^T n: the reading side.
     All of one point's are ``A m`` with the same ``A = [I; hat(p)]``, so that it adds
@@ -197,6 +254,7 @@ def _normal_matrices(
     sum2, n = 0.0, 0
     for i in range(len(moved)):
         xx = yy = zz = xy = xz = yz = a = b = c = 0.0
+        weights[i] = 0.0
         for j in range(indices.shape[1]):
             if not distances2[i, j] <= limit:
                 break
@@ -205,8 +263,11 @@ def _normal_matrices(
             r = (moved[i, 0] - points[q, 0]) * nx
             r += (moved[i, 1] - points[q, 1]) * ny
             r += (moved[i, 2] - points[q, 2]) * nz
+            if nx == 0.0 and ny == 0.0 and nz == 0.0:
+                continue
             sum2 += r * r
             n += 1
+            weights[i] += variances[q]
             x = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
             y = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
             z = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz

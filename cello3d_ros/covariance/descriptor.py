@@ -99,7 +99,7 @@ def _sum_cells(
     sums: Array,
     counts: Array,
 ) -> None:
-    """Add the planarity, cylindricality and nearest bin of each overlapping point to its cell."""
+    """Add planarity, cylindricality and nearest bin of each overlapping plane to its cell."""
     for i in range(len(points)):
         if not overlap[i]:
             continue
@@ -115,6 +115,8 @@ def _sum_cells(
         if cell < 0:
             continue
         x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+        if x == 0.0 and y == 0.0 and z == 0.0:
+            continue
         nx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z
         ny = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z
         nz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z

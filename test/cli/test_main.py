@@ -139,3 +139,18 @@ def test_ctrl_c_is_130_and_one_line(monkeypatch, capsys):
     monkeypatch.setattr("cello3d_ros.cli.info.describe", interrupted)
     assert main(["info", "x"]) == 130
     assert capsys.readouterr().err == "cello3d: interrupted\n"
+
+
+def test_an_interrupt_within_a_compiled_function_is_an_interrupt(monkeypatch, capsys):
+    """The interpreter then raises a SystemError whose cause is the interrupt."""
+    from cello3d_ros.cli import info
+
+    def interrupted(_):
+        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+    monkeypatch.setattr(info, "run", interrupted)
+    assert main(["info", "general"]) == 130
+    assert capsys.readouterr().err == "cello3d: interrupted\n"
+    monkeypatch.setattr(info, "run", lambda _: (_ for _ in ()).throw(SystemError("another")))
+    with pytest.raises(SystemError, match="another"):
+        main(["info", "general"])

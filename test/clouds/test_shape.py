@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from rings import scan, to_box, to_plane
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -54,7 +55,7 @@ def test_covariances_are_of_the_nearest_and_of_equally_far_ones_of_the_first(cas
     points = tree.points
     n, n_leaves = len(points), len(tree.lanes)
     found = np.empty((n_leaves, 6, 16))
-    covariances(tree.leaves, n, k, 0, n_leaves, found)
+    covariances(tree.leaves, n, k, 0, n_leaves, np.ones(n, np.bool_), found)
     difference = points - points[:, None]
     squares = difference[..., 0] ** 2 + difference[..., 1] ** 2 + difference[..., 2] ** 2
     first = np.argsort(squares, axis=1, kind="stable")[:, :k]
@@ -86,7 +87,8 @@ def test_shapes_are_those_of_the_eigenvalues(scale, ratios, noise):
     C = np.einsum("nij,nj,nkj->nik", turns, squares, turns)
     rows = C[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].reshape(3, 16, 6).transpose(0, 2, 1)
     normals, planarity, cylindricality = np.empty((45, 3)), np.empty(45), np.empty(45)
-    _shape(np.ascontiguousarray(rows), normals, planarity, cylindricality)
+    every = np.ones(45, np.bool_)
+    _shape(np.ascontiguousarray(rows), every, normals, planarity, cylindricality)
     values = np.linalg.eigvalsh(C)[:45]
     s3, s2, s1 = np.sqrt(np.maximum(values, 0.0)).T
     # s3 of a flat one is the square root of what rounding left
@@ -127,6 +129,41 @@ def test_normals_turn_with_the_cloud(room):
     np.testing.assert_allclose(planarity[back], turned_planarity[turned_back], atol=1e-9)
     cosines = np.einsum("ij,ij->i", normals[back] @ R.T, turned_normals[turned_back])
     assert (np.abs(cosines) > 1 - 1e-9).mean() > 0.999
+
+
+def tilts_deg(normals):
+    """Angles of the normals that there are from the vertical."""
+    planes = np.abs(normals).sum(axis=1) > 0
+    return np.degrees(np.arccos(np.minimum(np.abs(normals[planes, 2]), 1.0)))
+
+
+@pytest.mark.parametrize("n_beams", [16, 32])
+def test_rings_on_flat_ground_are_flat_or_no_plane(n_beams):
+    points = scan(to_plane(2, -1.5), np.eye(4), n_beams)
+    ring, _, _ = local_shape(build_tree(points), 20)
+    assert np.quantile(tilts_deg(ring), 0.5) > 2.0  # they lean by the beams' elevations
+    normals, _, cylindricality = local_shape(build_tree(points), 20, min_spread=0.25)
+    planes = np.abs(normals).sum(axis=1) > 0
+    assert planes.mean() > 0.2
+    assert np.quantile(tilts_deg(normals), 0.95) < 2.0
+    np.testing.assert_array_equal(planes, cylindricality <= 0.75)
+    np.testing.assert_allclose(np.linalg.norm(normals[planes], axis=1), 1.0)
+
+
+def test_only_points_on_a_line_get_a_wider_neighborhood():
+    tree = build_tree(scan(to_box(8.0, 5.0, 2.0), np.eye(4), 32))
+    plain, law = local_shape(tree, 20), local_shape(tree, 20, n_threads=2, min_spread=0.25)
+    spread = plain[2] <= 0.75
+    assert 0.2 < spread.mean() < 0.99
+    for a, b in zip(plain, law):
+        np.testing.assert_array_equal(a[spread], b[spread])
+    wide = local_shape(tree, 40)
+    second = ~spread & (wide[2] <= 0.75)
+    assert second.any()
+    for a, b in zip(wide, law):
+        np.testing.assert_array_equal(a[second], b[second])
+    line = np.linspace(0.0, 5.0, 200)[:, None] * [1.0, 2.0, 0.5]
+    np.testing.assert_array_equal(local_shape(build_tree(line), 20, min_spread=0.25)[0], 0.0)
 
 
 def test_prepare_filters_and_follows_its_seed(room):

@@ -7,12 +7,13 @@ from cello3d_ros.config import CloudConfig, IcpConfig
 from cello3d_ros.covariance.closed_form import (
     _implicit_derivative,
     _normal_matrices,
+    _tilted,
     censi,
     closed_form,
     common_bias,
 )
 from cello3d_ros.errors import RegistrationError
-from cello3d_ros.geometry.se3 import exp, inverse, log, transform
+from cello3d_ros.geometry.se3 import exp, hat, inverse, log, transform
 from cello3d_ros.registration.icp import icp
 from cello3d_ros.registration.overlap import Overlap
 
@@ -32,7 +33,9 @@ def normal_matrix(points, normals):
     """Return H for points that are associated with themselves."""
     n = len(points)
     zeros, own = np.zeros((n, 1)), np.arange(n)[:, None]
-    H, G, _, _ = _normal_matrices(points, points, points, normals, np.eye(3), zeros, own, 1.0)
+    H, G, _, _ = _normal_matrices(
+        points, points, points, normals, np.zeros(n), np.eye(3), zeros, own, 1.0, np.empty(n)
+    )
     np.testing.assert_array_equal(G, 0.0)  # no residuals
     return H
 
@@ -168,8 +171,45 @@ def test_the_sandwich_has_the_size_of_what_redrawing_the_reading_does(pair):
 def test_a_free_direction_is_an_error():
     rng = np.random.default_rng(35)
     ground = prepare(plane(rng, 2, -1.0, 3000)[0], CloudConfig(), rng)
-    with pytest.raises(RegistrationError, match="leaves a direction free"):
+    with pytest.raises(RegistrationError, match="holds x, y, yaw of the sensor: free here"):
         predictors(ground, ground, np.eye(4), IcpConfig())
+
+
+def test_points_without_a_plane_count_for_nothing():
+    """The closed forms of a cloud with normals of 0 are those of the cloud without them."""
+    P, Q, normals, indices, distances2, T = corners()
+    half = np.arange(len(Q)) % 2 == 0
+    bare = np.where(half[:, None], normals, 0.0)
+    alone = np.where(half[indices], distances2, np.inf)
+    order = np.argsort(alone, axis=1, kind="stable")
+    alone, swapped = (np.take_along_axis(a, order, axis=1) for a in (alone, indices))
+    every = IcpConfig(trim_ratio=1.0)
+    reading = cloud(P, normals)
+    found = closed_form(reading, cloud(Q, bare), T, overlap_of(distances2, indices), every)
+    config = IcpConfig(trim_ratio=float(np.isfinite(alone).mean()) - 1e-6)
+    expected = closed_form(reading, cloud(Q, normals), T, overlap_of(alone, swapped), config)
+    np.testing.assert_allclose(found.inverse_H, expected.inverse_H, rtol=1e-9)
+    np.testing.assert_allclose(found.sandwich, expected.sandwich, rtol=1e-9)
+    assert found.n_associations == expected.n_associations == half[indices].sum()
+    assert found.residual_rms_m == pytest.approx(expected.residual_rms_m)
+
+
+def test_what_errors_of_normals_alone_make_of_h_is_their_mean():
+    """Tilted normals of planes without a hold along x: H there is N, on average."""
+    rng = np.random.default_rng(37)
+    Q, normals = join(*(plane(rng, axis, 2.0, 200) for axis in (1, 2)))
+    sigma = 0.02
+    N = _tilted(Q, np.full(len(Q), sigma**2))
+    found = [
+        normal_matrix(Q, normals + sigma * rng.normal(size=normals.shape)) for _ in range(300)
+    ]
+    np.testing.assert_allclose(np.mean(found, axis=0)[0, 0], N[0, 0], rtol=0.05)
+    np.testing.assert_allclose(N[3:, 3:], normal_matrix_of_every_direction(Q, sigma), rtol=1e-12)
+
+
+def normal_matrix_of_every_direction(points, sigma):
+    """Sum of hat(p) hat(p)^T, times the variance."""
+    return sigma**2 * sum(hat(p) @ hat(p).T for p in points)
 
 
 def corners(n=12):
@@ -203,9 +243,9 @@ def minimum(P, Q, normals, kept, start):
 
 
 def cloud(points, normals):
-    zeros = np.zeros(len(points))
+    zeros, ones = np.zeros(len(points)), np.ones(len(points))
     tree = build_tree(points)
-    return Cloud(points, normals, zeros, zeros, tree)
+    return Cloud(points, normals, ones, zeros, tree)  # planes without noise
 
 
 def test_censi_is_the_derivative_of_the_minimum_by_every_coordinate():
