@@ -87,6 +87,10 @@ def _initialise(args: Sequence[str] | None) -> None:
         rclpy.init(args=None if args is None else list(args))
     except (RuntimeError, ValueError) as error:
         text = " ".join(str(error).split())
+        if "logging" in text:
+            raise ConfigError(
+                f"cannot write ROS logs; set ROS_LOG_DIR to a folder that can be written: {text}"
+            ) from None
         raise ConfigError(f"cannot start with these ROS arguments: {text}") from None
 
 
