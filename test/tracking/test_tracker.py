@@ -1,5 +1,7 @@
 """Pairs, chain and restarts, with and without real registrations."""
 
+import contextlib
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,13 @@ from cello3d_ros.config import Config, NodeConfig
 from cello3d_ros.covariance import estimator
 from cello3d_ros.covariance.estimator import Estimate
 from cello3d_ros.covariance.model import constant_model, load_model, shipped_model_path
-from cello3d_ros.errors import CloudError, CovarianceError, NoOverlapError, NotConvergedError
+from cello3d_ros.errors import (
+    CloudError,
+    CovarianceError,
+    NoOverlapError,
+    NotConvergedError,
+    RegistrationError,
+)
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import compound_right, is_positive_definite
 from cello3d_ros.registration.icp import Registration
@@ -588,3 +596,26 @@ def test_a_planar_robot_has_z_roll_and_pitch_of_its_odometry(asked, monkeypatch)
     )
     flat = tracker.step(4 * S, POINTS, NOWHERE)  # the guess stays on the floor, too
     assert abs(flat.pose.T[2, 3]) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("mount", "sentence"),
+    [
+        ([0.5, 0.2, 0.0, 0.0, 0.0, 0.3], "to and fro by 0.5"),
+        ([1.5, 0.0, 0.0, 0.0, 0.0, 3.1], "every other cloud"),
+    ],
+)
+def test_two_lidars_in_turn_on_one_topic_are_told(mount: list[float], sentence: str) -> None:
+    """By real registrations; one lidar, walking the same way, is not."""
+    node = NodeConfig()
+    X = [np.eye(4), se3.exp(mount)]
+    for turns in (True, False):
+        tracker = Tracker(load_model(shipped_model_path()), Config(node=node), node)
+        rng = np.random.default_rng(3)
+        for i in range(20):
+            T = se3.exp(np.array([0.05, 0.02, 0.0, 0.0, 0.0, 0.02]) * i)
+            points = se3.transform(se3.inverse(T @ X[i % 2 if turns else 0]), room(rng))
+            with contextlib.suppress(RegistrationError):
+                tracker.step(i * S // 10, points, Place(T))
+        assert (sentence in tracker.warning) == turns, tracker.warning
+        assert turns or tracker.warning == ""
