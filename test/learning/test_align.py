@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cello3d_ros.clouds.neighbors import build_tree
 from cello3d_ros.config import IcpConfig, Pipeline
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log, transform
-from cello3d_ros.learning.align import Alignment, align
+from cello3d_ros.learning.align import Alignment, _split, align
+from cello3d_ros.learning.align_sweeps import common_normals, neighbors_of
 from cello3d_ros.recordings.recording import Scan
 
 N_SCANS = 7
@@ -219,3 +221,33 @@ def test_the_motion_within_scans_is_undone() -> None:
 
     assert worst(found) < 0.005
     assert worst(found) < 0.5 * worst(smeared)
+
+
+def test_a_part_is_cut_where_a_pair_disagrees_and_short_pieces_are_dropped() -> None:
+    part = np.array([0, 0, 0, 0, -1, 0, 0, 0, 0, 0, 1, 1, 1])
+    cut = np.zeros(len(part), bool)
+    cut[[3, 5, 12]] = True
+    assert _split(part, cut).tolist() == [1, 1, 1, -1, -1, 0, 0, 0, 0, 0, -1, -1, -1]
+    assert _split(part, ~cut & False).tolist() == [0, 0, 0, 0, -1, 0, 0, 0, 0, 0, 1, 1, 1]
+
+
+def test_neighbors_are_the_eight_keyframes_on_either_side_without_the_scan_itself() -> None:
+    keyframes = np.arange(0, 60, 3)
+    assert neighbors_of(30, keyframes).tolist() == [*range(6, 30, 3), *range(33, 57, 3)]
+    assert neighbors_of(31, keyframes).tolist() == [*range(9, 33, 3), *range(33, 57, 3)]
+    assert neighbors_of(0, keyframes).tolist() == [*range(3, 27, 3)]
+
+
+def test_common_normals_see_the_surface_where_one_scan_sees_a_ring() -> None:
+    rng = np.random.default_rng(0)
+    rings = [
+        np.column_stack([np.linspace(0, 2, 80), np.full(80, y), np.zeros(80)]) for y in (0, 1)
+    ]
+    own = np.concatenate(rings) + rng.normal(scale=1e-3, size=(160, 3))
+    others = np.column_stack([rng.uniform(0, 2, (4000, 2)), rng.normal(scale=1e-3, size=4000)])
+    T = exp(np.array([1.0, 2.0, 3.0, 0.4, 0.5, 0.6]))
+    tree = build_tree(own)
+    normals = common_normals(tree, build_tree(transform(T, others)), T, 10)
+    assert np.abs(normals[:, 2]).min() > 0.99
+    alone = common_normals(tree, build_tree(own + 100.0), np.eye(4), 10)
+    assert np.abs(alone[:, 2]).min() < 0.5
