@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -106,7 +107,7 @@ def local_shape(
 
     for factor in _WIDENINGS if min_spread > 0.0 else _WIDENINGS[:1]:
         starts = range(0, len(tree.lanes), _CHUNK)
-        in_threads(lambda first, k=factor * k: task(first, k), starts, n_threads)
+        in_threads(partial(task, k=factor * k), starts, n_threads)
         wanted &= cylindricality > 1.0 - min_spread
     normals[wanted & (min_spread > 0.0)] = 0.0
     return normals, planarity, cylindricality
