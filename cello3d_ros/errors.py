@@ -22,6 +22,12 @@ class CloudError(Cello3dError):
     reason = "too_few_points"
 
 
+class PlanarCloudError(CloudError):
+    """A cloud is a 2-D scan."""
+
+    reason = "two_dimensional"
+
+
 class RegistrationError(Cello3dError):
     """ICP has no answer: too few points or a singular system."""
 

@@ -9,7 +9,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cello3d_ros.cli.sources import add_source_arguments, open_source, with_progress
+from cello3d_ros.cli.sources import (
+    add_source_arguments,
+    check_folder,
+    in_words,
+    open_source,
+    with_progress,
+)
 from cello3d_ros.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -44,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Convert; OUT appears when it is complete.  Raises RecordingError."""
+    check_folder(arguments.out)
     if arguments.out.exists():
         raise RecordingError(f"{arguments.out} exists already; give another name or remove it")
     recording = open_source(arguments.source, arguments)
@@ -57,15 +64,17 @@ def run(arguments: argparse.Namespace) -> None:
         "n_left_out": len(recording) - n_written,
         **counts,
         "n_poses_projected": recording.n_projected,
+        "skipped": recording.skipped,
+        "times": recording.times,
     }
-    print(json.dumps(summary) if arguments.json else _sentence(summary))
+    print(json.dumps(summary) if arguments.json else _sentence(summary, arguments.deskew))
 
 
 def _scans(arguments: argparse.Namespace, recording: Recording) -> Iterable[Scan]:
     from cello3d_ros.recordings.deskew import deskewed
 
     scans = deskewed(recording) if arguments.deskew else recording
-    progress: Iterable[Scan] = with_progress(scans, len(recording), recording.name)
+    progress: Iterable[Scan] = with_progress(scans, recording.n_declared, recording.name)
     return progress
 
 
@@ -92,13 +101,16 @@ def _write(arguments: argparse.Namespace, recording: Recording, scans: Iterable[
     return write_bag(out, scans, provenance=made_by, storage=kind, double=arguments.double)
 
 
-def _sentence(summary: dict[str, Any]) -> str:
+def _sentence(summary: dict[str, Any], deskew: bool) -> str:
     text = f"{summary['out']}: {summary['n_scans']} scans"
     if summary["n_left_out"]:
         text += f"; {summary['n_left_out']} left out, their poses do not cover them"
     for what in ("ground_truth", "odometry"):
         if 0 < (n := summary[f"n_with_{what}"]) < summary["n_scans"]:
             text += f"; only {n} have {what.replace('_', ' ')}"
+    text += in_words(summary["skipped"])
+    if deskew:
+        text += f"; times of points taken {summary['times']}"
     if summary["n_poses_projected"]:
         text += f"; {summary['n_poses_projected']} poses were not quite rigid and were made so"
     return text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,9 +28,7 @@ class Kind(NamedTuple):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
-    parser.add_argument(
-        "path", metavar="SOURCE", type=Path, help="model file, shipped model or recording"
-    )
+    parser.add_argument("path", metavar="SOURCE", type=Path, help="model, recording or dataset")
     add_source_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
@@ -137,7 +136,26 @@ def _settings(section: Any) -> dict[str, Any]:
     return {key: list(v) if isinstance(v, tuple) else v for key, v in vars(section).items()}
 
 
+def _describe_dataset(path: Path, _: argparse.Namespace) -> dict[str, Any]:
+    from cello3d_ros.learning.dataset import open_dataset
+
+    dataset = open_dataset(path)
+    keys = dataset.pair_keys()
+    outcomes = Counter(dataset.read(*key).reason or "accepted" for key in keys)
+    pairs = Counter(name for name, *_ in keys)
+    return {
+        "n_pairs": len(keys),
+        "outcomes": dict(sorted(outcomes.items())),
+        "recordings": {
+            name: f"{pairs[name]} pairs of {facts.get('n_scans', 'unknown')} scans"
+            for name, facts in dataset.recordings.items()
+        },
+        "sampling": _settings(dataset.sampling),
+    }
+
+
 KINDS = (
     Kind("model file (.npz)", lambda path: path.suffix == ".npz", _describe_model),
+    Kind("dataset", lambda path: (path / "manifest.json").is_file(), _describe_dataset),
     Kind("recording", is_recording, describe_recording),
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import os
 import sys
@@ -29,12 +30,17 @@ VERBS = {
 }
 
 
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb.  Returns 0, 1 for a known error, 2 for usage, 130 for Ctrl-C."""
     argv = sys.argv[1:] if argv is None else argv
     try:
         arguments = _parse(argv)
-        return int(arguments.run(arguments) or 0)
+        status = int(arguments.run(arguments) or 0)
+        sys.stdout.flush()
+        return status
     except Cello3dError as error:
         print(f"cello3d: {error}", file=sys.stderr)
         return 1
@@ -44,8 +50,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("cello3d: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output left, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _forget_output()
         return 0
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        _forget_output()
+        print(f"cello3d: cannot write the output: {error.strerror}", file=sys.stderr)
+        return 1
+
+
+def _forget_output() -> None:
+    """Send what is still to be printed nowhere: Python would complain of it at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from cello3d_ros.cli.sources import open_source, with_progress
+from cello3d_ros.clouds.filters import is_planar
 from cello3d_ros.errors import RecordingError
 
 
@@ -32,8 +33,10 @@ def describe_recording(path: Path, arguments: argparse.Namespace) -> dict[str, A
     found: dict[str, Any] = {"recording": kind_of(path), "name": recording.name}
     if isinstance(recording, ChallengingRecording):
         found["sequence"] = sequence_of(recording.name)
-    found |= _scans(with_progress(recording, len(recording), recording.name))
+    found |= _scans(with_progress(recording, recording.n_declared, recording.name))
+    found["times"] = recording.times or None
     found["n_poses_projected"] = recording.n_projected
+    found["skipped"] = recording.skipped or None
     if isinstance(recording, BagRecording):
         found["read_as"] = recording.topics._asdict()
         found["topics"] = {
@@ -44,11 +47,12 @@ def describe_recording(path: Path, arguments: argparse.Namespace) -> dict[str, A
 
 def _scans(scans: Any) -> dict[str, Any]:
     """Count what the scans have; ``time_span_s`` is the longest scan's."""
-    stamps, sizes, n_truth, n_odometry, n_intensity = [], [], 0, 0, 0
+    stamps, sizes, n_truth, n_odometry, n_intensity, n_planar = [], [], 0, 0, 0, 0
     spans, length_m, before = [], 0.0, None
     for scan in scans:
         stamps.append(scan.stamp_ns)
         sizes.append(len(scan.points))
+        n_planar += is_planar(scan.points)
         n_odometry += scan.T_odom_sensor is not None
         n_intensity += scan.intensity is not None
         if scan.time_s is not None and len(scan.time_s):
@@ -67,6 +71,7 @@ def _scans(scans: Any) -> dict[str, Any]:
             "max": max(sizes, default=0),
             "total": sum(sizes),
         },
+        "n_scans_2d": n_planar,
         "n_scans_with_ground_truth": n_truth,
         "n_scans_with_odometry": n_odometry,
         "n_scans_with_intensity": n_intensity,

@@ -5,18 +5,20 @@ from __future__ import annotations
 import argparse
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cello3d_ros.cli.sources import add_source_arguments, open_source, with_progress
+from cello3d_ros.cli.sources import add_source_arguments, in_words, open_source, with_progress
 from cello3d_ros.errors import RecordingError
 
 if TYPE_CHECKING:
     from cello3d_ros.config import NodeConfig
     from cello3d_ros.geometry.gaussian import GaussianPose
     from cello3d_ros.geometry.se3 import Array
+    from cello3d_ros.recordings import Recording
     from cello3d_ros.tracking.offline import Step
     from cello3d_ros.tracking.tracker import Answer
 
@@ -42,19 +44,22 @@ def run(arguments: argparse.Namespace) -> None:
 
     Raises Cello3dError; RecordingError when no pair was answered.
     """
-    from cello3d_ros.config import PIPELINE, Config, load_config
+    from cello3d_ros.config import PIPELINE, Config, NodeConfig, load_config
     from cello3d_ros.covariance.model import load_model
     from cello3d_ros.tracking.offline import replay
     from cello3d_ros.tracking.tracker import Tracker
 
-    recording = open_source(arguments.recording, arguments)
-    model = load_model(arguments.model)
     node = load_config(arguments.config).node if arguments.config else Config().node
+    if arguments.extrinsic is None and node.T_base_sensor != NodeConfig().T_base_sensor:
+        arguments.extrinsic = node.T_base_sensor
+    recording = open_source(arguments.recording, arguments)
+    node = replace(node, T_base_sensor=_extrinsic(recording, arguments.extrinsic))
+    model = load_model(arguments.model)
     config = Config(**{name: getattr(model.pipeline, name) for name in PIPELINE}, node=node)
     tracker = Tracker(model, config, node)
     steps = replay(recording, tracker, node)
     counts = write_answers(
-        arguments.out, with_progress(steps, len(recording), recording.name), node
+        arguments.out, with_progress(steps, recording.n_declared, recording.name), node
     )
     n_pairs = max(0, len(recording) - 1)
     summary = {
@@ -63,8 +68,23 @@ def run(arguments: argparse.Namespace) -> None:
         "n_answered": counts.pop("", 0),
         "n_restarts": tracker.n_restarts,
         "failures": {k: n for k, n in counts.items() if k != "reference"},
+        "skipped": recording.skipped,
     }
     print(json.dumps(summary) if arguments.json else _sentence(summary))
+
+
+def _extrinsic(recording: Recording, given: Sequence[float] | None) -> tuple[float, ...]:
+    """Return the sensor's pose, x y z and quaternion, in the frame of the odometry's poses.
+
+    As given, else as the transforms of a bag say.
+    """
+    from cello3d_ros.geometry.se3 import quaternion
+    from cello3d_ros.recordings.bag import BagRecording
+
+    if given is None and isinstance(recording, BagRecording) and recording.topics.odometry:
+        T = recording.extrinsic(recording.topics.odometry)
+        return (*map(float, T[:3, 3]), *map(float, quaternion(T)))
+    return tuple(given or (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
 
 
 def write_answers(out: Path, steps: Any, config: NodeConfig) -> Counter[str]:
@@ -73,19 +93,32 @@ def write_answers(out: Path, steps: Any, config: NodeConfig) -> Counter[str]:
     from cello3d_ros.recordings.bag_writer import write_messages
 
     counts: Counter[str] = Counter()
+    sentences: dict[str, str] = {}
     with new_folder(out) as folder, ExitStack() as stack:
         folder.mkdir()
         poses = stack.enter_context((folder / "poses.tum").open("w"))
         lines = stack.enter_context((folder / "covariances.jsonl").open("w"))
-        messages = _recorded(steps, poses, lines, config, counts)
+        messages = _recorded(_noted(steps, counts, sentences), poses, lines, config)
         write_messages(folder / "bag", messages, {"made_by": "cello3d replay"})
         if not counts[""]:
-            raise RecordingError(f"no pair was answered: {dict(counts)}")
+            told = "; ".join(f"{counts[name]} {text}" for name, text in sentences.items())
+            raise RecordingError(f"no pair was answered: {told or 'there is only one cloud'}")
     return counts
 
 
+def _noted(
+    steps: Iterable[Step], counts: Counter[str], sentences: dict[str, str]
+) -> Iterator[Step]:
+    """Yield the steps; count their reasons and keep the first sentence of each failure."""
+    for step in steps:
+        counts[step.reason] += 1
+        if step.sentence:
+            sentences.setdefault(step.reason, f"{step.reason.replace('_', ' ')} ({step.sentence})")
+        yield step
+
+
 def _recorded(
-    steps: Iterator[Step], poses: Any, lines: Any, config: NodeConfig, counts: Counter[str]
+    steps: Iterator[Step], poses: Any, lines: Any, config: NodeConfig
 ) -> Iterator[tuple[str, int, Any]]:
     """Write each step to the two text files and yield its messages."""
     from rosbags.typesys import Stores, get_typestore
@@ -95,7 +128,6 @@ def _recorded(
 
     make = Messages(get_typestore(Stores.ROS2_JAZZY))
     for step in steps:
-        counts[step.reason] += 1
         stamp_ns = step.scan.stamp_ns
         if (answer := step.answer) is None:
             failure = {"stamp_ns": stamp_ns, "reason": step.reason, "sentence": step.sentence}
@@ -140,4 +172,4 @@ def _sentence(summary: dict[str, Any]) -> str:
     text = f"{summary['out']}: {summary['n_answered']} of {summary['n_pairs']} pairs answered"
     for reason, n in summary["failures"].items():
         text += f"; {n} {reason.replace('_', ' ')}"
-    return text
+    return text + in_words(summary["skipped"])

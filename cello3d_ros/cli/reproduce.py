@@ -73,8 +73,7 @@ def _add_places(parser: argparse.ArgumentParser) -> None:
         "--results",
         type=Path,
         metavar="FILE",
-        help="Markdown page whose sections are written; docs/results.md in a checkout of this "
-        "package, else DIR/results.md",
+        help="Markdown page whose sections are written (DIR/results.md)",
     )
 
 
@@ -111,7 +110,7 @@ def _make(what: str, arguments: argparse.Namespace) -> None:
     else:
         result = _figure(what)(n_samples, arguments.jobs, arguments.seed)
     cpu_s = time.process_time() - start + costs.earlier()
-    page = arguments.results or _default_page(out)
+    page = arguments.results or out / "results.md"
     publish(result, out, page, _command(result.what, arguments), cpu_s)
     print(f"{result.what}: {cpu_s:.0f} s of processor time; {out}/{result.what}.png, {page}")
 
@@ -149,12 +148,6 @@ def _figure(what: str) -> Callable[[int, int, int], Result]:
         "fig-cylinder": cylinder.make,
         "fig-hallway": hallway.make,
     }[what]
-
-
-def _default_page(out: Path) -> Path:
-    manifest = Path("package.xml")
-    is_checkout = manifest.is_file() and "<name>cello3d_ros</name>" in manifest.read_text()
-    return Path("docs/results.md") if is_checkout else out / "results.md"
 
 
 def _command(what: str, arguments: argparse.Namespace) -> str:

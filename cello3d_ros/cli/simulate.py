@@ -9,13 +9,13 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cello3d_ros.cli.sources import with_progress
+from cello3d_ros.cli.sources import check_folder, with_progress
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.simulation.drives import MOTIONS, Drive
 from cello3d_ros.simulation.products import SCANNERS
 from cello3d_ros.simulation.rescan import KEY, told
 from cello3d_ros.simulation.scanner import Scanner
-from cello3d_ros.simulation.simulation import Simulation
+from cello3d_ros.simulation.simulation import Simulation, n_poses
 from cello3d_ros.simulation.worlds import WORLDS
 
 
@@ -27,7 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seeds", type=int, metavar="N", help="N bags OUT/WORLD-SEED, of this and later seeds"
     )
-    parser.add_argument("--scans", type=int, default=25, help="number of scans")
+    parser.add_argument(
+        "--scans", type=int, help="number of scans (25; with --path all of its poses)"
+    )
     parser.add_argument(
         "--drive",
         choices=MOTIONS,
@@ -62,6 +64,10 @@ def run(arguments: argparse.Namespace) -> None:
     n_seeds = 1 if arguments.seeds is None else arguments.seeds
     if n_seeds < 1:
         raise RecordingError(f"--seeds must be at least 1: {n_seeds}")
+    if arguments.seeds is None:
+        check_folder(arguments.out)
+    if arguments.scans is None:
+        arguments.scans = 25 if arguments.path is None else n_poses(arguments.path)
     for seed in range(arguments.seed, arguments.seed + n_seeds):
         simulation = Simulation(
             str(arguments.world), seed, arguments.scans, scanner, arguments.path, drive=drive

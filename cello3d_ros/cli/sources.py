@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from cello3d_ros.recordings import Recording
 
 
+_FILES = (".bag", ".mcap", ".db3", ".ply", ".pcd", ".npy", ".bin", ".csv")
 SIMULATED = "simulated"
 
 
@@ -40,17 +41,39 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
         "--poses",
         type=Path,
         metavar="FILE",
-        help="TUM or KITTI poses of a folder of clouds; in align and graph of any recording, in "
-        "graph also the word joint",
+        help="ground truth: a TUM file, or KITTI's by order; in graph also the word joint",
     )
+    parser.add_argument("--time-field", metavar="NAME", help="field with the times of the points")
+    parser.add_argument("--time-unit", choices=("s", "ms", "us", "ns"), help="their unit")
+    parser.add_argument(
+        "--time-offset",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="seconds to add to the stamps of clouds, so that they are on the clock of the poses",
+    )
+    parser.add_argument(
+        "--strict",
+        action="store_true",
+        help="refuse a recording for one message that cannot be read; else it is left out",
+    )
+
+
+def check_folder(out: Path) -> None:
+    """Refuse a folder named like a file: ``bag.mcap`` would become ``bag.mcap/bag.mcap.mcap``."""
+    if out.suffix.lower() in _FILES:
+        raise RecordingError(
+            f"{out}: a folder is made, name it without an ending: {out.with_suffix('')}"
+        )
 
 
 def open_source(path: Path, arguments: argparse.Namespace) -> Recording:
     """Return the recording.  Raises RecordingError."""
     import numpy as np
 
+    from cello3d_ros.clouds.point_times import Clock
     from cello3d_ros.geometry import se3
-    from cello3d_ros.recordings import open_recording
+    from cello3d_ros.recordings import ReadOptions, open_recording
     from cello3d_ros.recordings.odometry import SimulatedOdometry
 
     T_base_sensor = None
@@ -62,14 +85,30 @@ def open_source(path: Path, arguments: argparse.Namespace) -> Recording:
     is_simulated = arguments.odometry == SIMULATED
     recording = open_recording(
         path,
-        arguments.points,
-        None if is_simulated else arguments.odometry,
-        arguments.ground_truth,
-        ground_truth_frames=None if frames is None else (frames[0], frames[1]),
-        T_base_sensor=T_base_sensor,
-        poses=arguments.poses,
+        ReadOptions(
+            points=arguments.points,
+            odometry=None if is_simulated else arguments.odometry,
+            ground_truth=arguments.ground_truth,
+            ground_truth_frames=None if frames is None else (frames[0], frames[1]),
+            T_base_sensor=T_base_sensor,
+            poses=arguments.poses,
+            clock=Clock(
+                field=arguments.time_field,
+                unit=arguments.time_unit,
+                cloud_offset_s=arguments.time_offset,
+            ),
+            strict=arguments.strict,
+        ),
     )
     return SimulatedOdometry(recording) if is_simulated else recording
+
+
+def in_words(skipped: dict[str, int]) -> str:
+    """Return what was left out of a recording as the end of a sentence, "" if nothing was."""
+    return "".join(
+        f"; {n} {'message' if n == 1 else 'messages'} left out: {reason.replace('_', ' ')}"
+        for reason, n in skipped.items()
+    )
 
 
 def with_progress(scans: Iterable[Any], total: int, name: str) -> Any:

@@ -16,6 +16,14 @@ def crop_range(points: Array, min_m: float, max_m: float) -> Array:
     return _kept(points, (range2 >= min_m**2) & (range2 <= max_m**2))
 
 
+def is_planar(points: Array) -> bool:
+    """Return whether points (N, 3) are a 2-D scan: all in one plane through the sensor."""
+    if len(points) < 3:
+        return False
+    least, _, most = np.linalg.eigvalsh(points.T @ points)
+    return bool(least <= 1e-12 * most)
+
+
 def limit_density(
     points: Array, voxel_m: float, max_points: int, rng: np.random.Generator
 ) -> Array:

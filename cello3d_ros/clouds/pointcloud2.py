@@ -84,9 +84,11 @@ def _records(message: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
     row, row_step = width * dtype.itemsize, int(message.row_step)
     if width == 0 or height == 0:
         return np.empty(0, dtype)
+    data = np.frombuffer(message.data, dtype=np.uint8)
+    if height == 1 or row_step == 0 or data.size == height * row:
+        row_step = row  # some drivers leave it unset or that of another cloud
     if row_step < row:
         raise CloudError(f"PointCloud2 row_step {row_step} is less than width*point_step {row}")
-    data = np.frombuffer(message.data, dtype=np.uint8)
     declared = (height - 1) * row_step + row
     if data.size < declared:
         raise CloudError(f"PointCloud2 declares {declared} bytes but holds {data.size}")

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.covariances import covariances
-from cello3d_ros.clouds.filters import crop_range, limit_density
+from cello3d_ros.clouds.filters import crop_range, is_planar, limit_density
 from cello3d_ros.clouds.leaves import WIDTH
 from cello3d_ros.clouds.neighbors import KdTree, build_tree
 from cello3d_ros.compiled import kernel
 from cello3d_ros.config import CloudConfig
-from cello3d_ros.errors import CloudError
+from cello3d_ros.errors import CloudError, PlanarCloudError
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.threads import in_threads
 
@@ -60,6 +60,11 @@ def filtered(
         raise CloudError(
             f"{len(kept)} of {len(points)} points are left between {config.min_range_m:g} m and "
             f"{config.max_range_m:g} m, need at least {config.n_neighbors}"
+        )
+    if is_planar(kept):
+        raise PlanarCloudError(
+            "the cloud is a 2-D scan, all its points lie in one plane with the sensor: it leaves "
+            "height, roll and pitch free; a 3-D lidar is needed"
         )
     tree = build_tree(kept, n_threads)
     tree = tree._replace(order=np.arange(len(kept)))

@@ -149,6 +149,15 @@ class PoseTrack:
         except PoseError:
             return None
 
+    def near(self, stamp_ns: int, tolerance_ns: int = 1_000_000) -> Array | None:
+        """Return ``at`` a stamp, or the first or last pose when just outside of the track."""
+        if not self._stamps:
+            return None
+        first, last = self._stamps[0], self._stamps[-1]
+        if first - tolerance_ns <= stamp_ns <= last + tolerance_ns:
+            return self.at(min(max(stamp_ns, first), last))
+        return None
+
     def pose(self, stamp_ns: int) -> Array:
         """Return the (4, 4) pose at a stamp.
 

@@ -30,11 +30,22 @@ class AlignedPart:
 
     has_odometry = False
     n_projected = 0
+    times = ""  # the motion within the scans has been undone
 
     @property
     def name(self) -> str:
         """Name of the recording; a part beyond the first has its number, from 2, behind it."""
         return self.recording.name + (f".{self.part + 1}" if self.part else "")
+
+    @property
+    def n_declared(self) -> int:
+        """How many scans it has."""
+        return len(self)
+
+    @property
+    def skipped(self) -> dict[str, int]:
+        """As of the recording."""
+        return self.recording.skipped
 
     def __len__(self) -> int:
         return len(self.alignment.members(self.part))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from threadpoolctl import threadpool_limits
 
 from cello3d_ros.config import Config, pipeline_of
-from cello3d_ros.errors import ConfigError
+from cello3d_ros.errors import ConfigError, RecordingError
 from cello3d_ros.learning.aligned import AlignedPart, pose_facts
 from cello3d_ros.learning.dataset import Dataset, PairRecord, open_dataset
 from cello3d_ros.learning.identity import fingerprint, scan_prints
@@ -53,6 +53,9 @@ def sample(
     config = config or Config()
     sampling, pipeline = config.sampling, pipeline_of(config)
     opened = _opened(recordings, sampling.noise_m > 0.0)
+    for recording in opened.values():
+        report(Status(f"reading {recording.name}"))
+        _check_usable(recording)
     dataset = open_dataset(out, pipeline, sampling, create=True)
     for recording in opened.values():
         report(Status(f"reading {recording.name}"))
@@ -85,6 +88,14 @@ def _opened(paths: Sequence[Path | str | Recording], rescan: bool) -> dict[str, 
         name = names.most_common(1)[0][0]
         raise ConfigError(f"two recordings are named {name!r}: their pairs would mix")
     return opened
+
+
+def _check_usable(recording: Recording) -> None:
+    """Raise RecordingError where a recording can give no pair, before a dataset is begun."""
+    if (n_scans := len(recording)) < 2:
+        raise RecordingError(f"{recording.name} has {n_scans} scans, a pair needs two")
+    if not any(scan.T_world_sensor is not None for scan in recording):
+        raise RecordingError(f"{recording.name} has no ground truth, sampling needs it")
 
 
 def _add(dataset: Dataset, recording: Recording) -> None:

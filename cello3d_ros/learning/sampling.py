@@ -39,6 +39,12 @@ _FEWEST_KEPT = 12  # twice the dimensions: fewer make no covariance worth learni
 Progress = Callable[[int], None]  # told how many registrations were done since the last call
 
 
+class NoTruthError(CloudError):
+    """A scan has no ground truth: nothing can be sampled of it."""
+
+    reason = "no_ground_truth"
+
+
 class Prepared(NamedTuple):
     """A scan's cloud, or why it has none; its true pose; if wanted, how to scan it again."""
 
@@ -112,8 +118,8 @@ def sample_recording(
 
     One pass that remembers ``max_gap`` scans.  Each record follows from the recording, its name
     and the settings alone: which others are done and the number of threads do not matter.
-    Raises RecordingError when a scan has no ground truth or the recording ends before the last
-    pair; what was yielded before stands.
+    Raises RecordingError when the recording ends before the last pair; what was yielded before
+    stands.
     """
     by_reading = {j: [i for i, reading in todo if reading == j] for _, j in todo}
     needed = {index for ij in todo for index in ij}
@@ -190,8 +196,8 @@ def describe_pair(pair: Pair, pipeline: Pipeline, sampling: SamplingConfig) -> P
         described = describe(
             reading, reference, at_truth.T_ref_read, pipeline, sampling.n_rotations
         )
-    except CloudError:
-        return replace(base, reason="too_few_points")
+    except CloudError as error:
+        return replace(base, reason=error.reason)
     except NoOverlapError:
         return replace(base, reason="no_overlap")
     except RegistrationError:
@@ -322,11 +328,11 @@ def prepare_scan(
 ) -> Prepared:
     """Return the cloud of scan ``index`` of a recording, or why it has none, and its true pose.
 
-    Its echoes are kept where registrations are to scan it again.  Raises RecordingError when it
-    has no true pose.
+    Its echoes are kept where registrations are to scan it again.  A scan without a true pose has
+    no cloud and the identity in its place: its pairs are rejected.
     """
     if scan.T_world_sensor is None:
-        raise RecordingError(f"{name}: scan {index} has no ground truth, sampling needs it")
+        return Prepared(NoTruthError(f"{name}: scan {index} has no ground truth"), np.eye(4))
     rng = np.random.default_rng([sampling.seed, _name_seed(name), index])
     T_world_sensor = np.array(scan.T_world_sensor, order="C")
     try:

@@ -2,103 +2,108 @@
 
 from __future__ import annotations
 
+from collections import Counter, deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from dataclasses import replace
+from functools import cached_property
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
+from numpy.typing import NDArray
 
-from cello3d_ros.clouds.point_times import INTENSITIES, NAMES, TimeLaw, recognise, relative_s
+from cello3d_ros.clouds import livox
+from cello3d_ros.clouds.point_times import (
+    INTENSITIES,
+    Clock,
+    PointTimesError,
+    TimeLaw,
+    law_of,
+    relative_s,
+)
 from cello3d_ros.clouds.pointcloud2 import read_fields
-from cello3d_ros.errors import Cello3dError, RecordingError
+from cello3d_ros.errors import CloudError, RecordingError
 from cello3d_ros.geometry.pose_track import PoseError, PoseTrack, checked_pose
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.geometry.transforms import NotConnectedError, TransformTree
-from cello3d_ros.recordings.recording import Scan
+from cello3d_ros.recordings.bag_reader import (
+    ENDINGS,
+    check_sqlite,
+    one_sentence,
+    open_bag,
+    parts_of,
+    reason_in_words,
+)
+from cello3d_ros.recordings.recording import LenientRecording, ReadOptions, Scan, Skips
 from cello3d_ros.recordings.topics import POSE_TYPES, TF_STATIC, TF_TYPES, choose
 
-__all__ = ["BagRecording"]
+_N_FIRST = 10  # clouds from which it is seen how times are to be read
 
-_ENDINGS = (".bag", ".mcap", ".db3")
+
+class _Message(NamedTuple):
+    """A message as read.  stamp_ns: its own stamp, else the time at which it was recorded."""
+
+    topic: str
+    kind: str
+    stamp_ns: int
+    content: Any
 
 
 class _Poses:
     """What a bag says of poses: tracks by topic, the frames they are of, and transforms."""
 
-    def __init__(self) -> None:
+    def __init__(self, skips: Skips) -> None:
+        self.skips = skips
         self.tracks: dict[str, PoseTrack] = {}
         self.child_frames: dict[str, str] = {}
         self.tree = TransformTree()
 
 
-class BagRecording:
+class BagRecording(LenientRecording):
     """The clouds of one topic, with odometry and ground truth interpolated at their stamps.
 
-    A topic that is not named is found by its type: the only PointCloud2; the only Odometry, or
+    A topic that is not named is found by its type: the only cloud; the only Odometry, or
     ``/odom`` of several; for ground truth ``/ground_truth``, or the only PoseStamped or
     TransformStamped.  The empty name says that there is none.  ``ground_truth_frames`` takes the
     ground truth from TF instead: the pose of the second frame in the first.
 
     Poses of another frame than the clouds' are moved to the sensor by ``T_base_sensor``, else by
-    the static transforms; where neither says anything they are taken as those of the sensor.
+    the transforms that are static or never change; poses that name no frame are the sensor's.
     A message without a stamp (0) has the time at which it was recorded.
 
-    Raises RecordingError, in one sentence with the path, for whatever is wrong with the bag.
+    Messages that cannot be read are left out and counted.  Raises RecordingError, in one sentence
+    with the path, for whatever else is wrong with the bag.
     """
 
-    def __init__(
-        self,
-        path: Path | str,
-        points_topic: str | None = None,
-        odometry_topic: str | None = None,
-        ground_truth_topic: str | None = None,
-        *,
-        ground_truth_frames: tuple[str, str] | None = None,
-        T_base_sensor: Array | None = None,
-    ) -> None:
+    def __init__(self, path: Path | str, options: ReadOptions | None = None) -> None:
+        """Read what the bag says of its topics."""
         self.path = Path(path)
-        self._frames, self._T_base_sensor = ground_truth_frames, T_base_sensor
-        self._poses: _Poses | None = None
-        with _one_sentence(self.path):
-            self._parts = _parts(self.path)
-            for file in [self.path] if self.path.is_file() else sorted(self.path.glob("*.db3")):
-                _check_length(file)
-        with _one_sentence(self.path), self._reader() as reader:
+        options = options or ReadOptions()
+        super().__init__(self.path, options)
+        self._frames, self._T_base_sensor = options.ground_truth_frames, options.T_base_sensor
+        with one_sentence(self.path):
+            self._parts = parts_of(self.path)
+            check_sqlite(self.path)
+        with one_sentence(self.path), open_bag(self._parts) as reader:
             self.types = {c.topic: c.msgtype for c in reader.connections}
             self.counts = dict.fromkeys(self.types, 0)
             for c in reader.connections:
                 self.counts[c.topic] += c.msgcount
-            named = "" if ground_truth_frames is not None else ground_truth_topic
-            self.topics = choose(self.types, points_topic, odometry_topic, named)
-            if ground_truth_frames is not None and not self._tf_topics():
+            named = "" if self._frames is not None else options.ground_truth
+            self.topics = choose(self.types, options.points, options.odometry, named)
+            if self._frames is not None and not self._tf_topics():
                 raise RecordingError("has no TFMessage topic to take ground truth from")
 
     @property
     def name(self) -> str:
         """Name of the file or folder, without its ending."""
-        return self.path.stem if self.path.suffix in _ENDINGS else self.path.resolve().name
+        return self.path.stem if self.path.suffix in ENDINGS else self.path.resolve().name
 
-    def __len__(self) -> int:
+    @property
+    def n_declared(self) -> int:
+        """How many clouds the bag says it has."""
         return self.counts[self.topics.points]
-
-    def __iter__(self) -> Iterator[Scan]:
-        n, before_ns = 0, -1
-        law: TimeLaw | None = None
-        for _, stamp_ns, message in self._messages({self.topics.points}):
-            with _one_sentence(self.path, f"cloud {n} of {self.topics.points}: "):
-                scan, law = _scan(message, stamp_ns, law)
-                if stamp_ns <= before_ns:
-                    raise RecordingError(f"its stamp {stamp_ns} does not follow {before_ns}")
-                frame = message.header.frame_id
-                truth = self._truth(stamp_ns, frame)
-                odometry = self._pose(self.topics.odometry, stamp_ns, frame)
-            n, before_ns = n + 1, stamp_ns
-            yield Scan(**{**vars(scan), "T_world_sensor": truth, "T_odom_sensor": odometry})
-        if n < len(self):
-            raise RecordingError(f"{self.path}: ends early, after {n} of {len(self)} clouds")
 
     @property
     def n_projected(self) -> int:
@@ -110,158 +115,239 @@ class BagRecording:
         """Whether there is a topic of odometry."""
         return self.topics.odometry is not None
 
+    @property
+    def skipped(self) -> dict[str, int]:
+        """How many clouds and poses were left out, by reason, once the scans have been read."""
+        poses = self.__dict__.get("_poses")
+        return dict(self._cloud_skips.counts + (poses.skips.counts if poses else Counter()))
+
+    def __iter__(self) -> Iterator[Scan]:
+        for scan, frame in self._kept():
+            with one_sentence(self.path):
+                truth = self._truth(scan.stamp_ns, frame)
+                odometry = self._pose(self.topics.odometry, scan.stamp_ns, frame)
+            yield replace(scan, T_world_sensor=truth, T_odom_sensor=odometry)
+
     def odometry(self) -> Iterator[tuple[int, Array]]:
         """Yield every odometry message as its stamp and T_odom_base (4, 4), in order of time."""
         if self.topics.odometry is not None:
-            yield from self._read_poses().tracks[self.topics.odometry]
+            yield from self._poses.tracks[self.topics.odometry]
 
     def track(self) -> PoseTrack | None:
         """Return the sensor's poses at all odometry messages, else all of ground truth's."""
         topic = self.topics.odometry or self.topics.ground_truth
         if topic is None:
             return None
-        track = self._read_poses().tracks[topic]
-        _, _, first = next(self._messages({self.topics.points}))
+        track = self._poses.tracks[topic]
         T = np.array([T for _, T in track]).reshape(-1, 4, 4)
-        T_base_sensor = self._extrinsic(topic, first.header.frame_id)
-        return PoseTrack.of_poses(track.stamps_ns, T @ T_base_sensor)
+        return PoseTrack.of_poses(track.stamps_ns, T @ self.extrinsic(topic))
+
+    def extrinsic(self, topic: str) -> Array:
+        """Return the pose (4, 4) of the clouds' frame in the frame whose poses a topic tells."""
+        frames = (m.content.header.frame_id for m in self._messages({self.topics.points}))
+        with one_sentence(self.path):
+            return self._extrinsic(topic, next(frames, ""))
+
+    def _law(self) -> TimeLaw | None:
+        first = []
+        for message in islice(self._messages({self.topics.points}), _N_FIRST):
+            if message.kind in livox.TYPES:
+                return TimeLaw(1)
+            try:
+                values = _columns(message, self._clock).get("time")
+            except PointTimesError:
+                raise
+            except CloudError:
+                continue
+            first.append((values, message.stamp_ns))
+        return law_of(first, self._clock.unit)
+
+    def _clouds(self, skips: Skips) -> Iterator[tuple[Scan, str]]:
+        """Yield each cloud as a scan without poses, and its frame."""
+        topic, counts = self.topics.points, Counter[str]()
+        law, _ = self._times
+        for n, message in enumerate(in_order(self._messages({topic}, skips, counts), skips)):
+            try:
+                scan = _scan(message, law, self._clock)
+            except CloudError as error:
+                skips.add("malformed", f"cloud {n} of {topic}: {error}")
+                continue
+            yield scan, message.content.header.frame_id
+        if counts[topic] < self.n_declared:
+            raise RecordingError(
+                f"{self.path}: ends early, after {counts[topic]} of {self.n_declared} clouds"
+            )
 
     def _truth(self, stamp_ns: int, frame: str) -> Array | None:
         if self._frames is None:
             return self._pose(self.topics.ground_truth, stamp_ns, frame)
-        tree = self._read_poses().tree
         try:
-            return tree.at(*self._frames, stamp_ns) @ self._moved(self._frames[1], frame)
+            T = self._poses.tree.at(*self._frames, stamp_ns)
         except NotConnectedError:
             raise
         except PoseError:
             return None
+        return T @ self._moved(self._frames[1], frame, "TF")
 
     def _pose(self, topic: str | None, stamp_ns: int, frame: str) -> Array | None:
         if topic is None:
             return None
-        T = self._read_poses().tracks[topic].at(stamp_ns)
+        T = self._poses.tracks[topic].at(stamp_ns)
         return None if T is None else T @ self._extrinsic(topic, frame)
 
     def _extrinsic(self, topic: str, frame: str) -> Array:
-        """Return the pose (4, 4) of the clouds' frame in the frame whose pose a topic tells."""
-        return self._moved(self._read_poses().child_frames.get(topic, frame), frame)
+        return self._moved(self._poses.child_frames.get(topic, frame), frame, topic)
 
-    def _moved(self, base: str, frame: str) -> Array:
+    def _moved(self, base: str, frame: str, topic: str) -> Array:
+        """Return T_base_frame.  Raises RecordingError where nobody says it."""
         if self._T_base_sensor is not None:
             return self._T_base_sensor
-        T = None if base == frame else self._read_poses().tree.constant(base, frame)
-        return np.eye(4) if T is None else T
+        if base.strip("/") == frame.strip("/"):
+            return np.eye(4)
+        T = self._poses.tree.constant(base, frame)
+        if T is None:
+            raise RecordingError(
+                f"the poses on {topic} are of {base!r}, the clouds of {frame!r}, and no constant "
+                "transform connects them: say where the sensor is with --extrinsic X Y Z QX QY QZ "
+                "QW (0 0 0 0 0 0 1 where it is the same)"
+            )
+        return T
 
-    def _read_poses(self) -> _Poses:
-        """Return all poses of the bag but the clouds, read once, in one pass."""
-        if self._poses is None:
-            poses = _Poses()
-            wanted = {t for t in self.topics[1:] if t is not None}
-            poses.tracks = {t: PoseTrack() for t in wanted}
-            n_read = dict.fromkeys(wanted, 0)
-            for topic, stamp_ns, message in self._messages(wanted | self._tf_topics()):
-                with _one_sentence(self.path, f"{topic}: "):
-                    if topic in wanted:
-                        T = checked_pose(*POSE_TYPES[self.types[topic]](message))
-                        poses.tracks[topic].add(stamp_ns, T)
-                        n_read[topic] += 1
-                        if child := getattr(message, "child_frame_id", ""):
-                            poses.child_frames.setdefault(topic, child)
-                    else:
-                        for sentence in poses.tree.add(message, topic.endswith(TF_STATIC)):
-                            raise RecordingError(sentence)
-            for t in wanted:
-                with _one_sentence(self.path, f"{t}: "):
-                    if (n := n_read[t]) < self.counts[t]:
-                        raise RecordingError(f"ends early, after {n} of {self.counts[t]} poses")
-            self._poses = poses
-        return self._poses
+    @cached_property
+    def _poses(self) -> _Poses:
+        """All poses of the bag, read once, in one pass."""
+        poses, counts = _Poses(Skips(self.path, self._strict)), Counter[str]()
+        wanted = {t for t in self.topics[1:] if t is not None}
+        poses.tracks = {t: PoseTrack() for t in wanted}
+        for message in self._messages(wanted | self._tf_topics(), poses.skips, counts):
+            with one_sentence(self.path, f"{message.topic}: "):
+                self._remember(message, poses)
+        for t in wanted:
+            if (n := counts[t]) < self.counts[t]:
+                raise RecordingError(
+                    f"{self.path}: {t}: ends early, after {n} of {self.counts[t]} poses"
+                )
+            if n and not len(poses.tracks[t]):
+                raise RecordingError(
+                    f"{self.path}: {t}: none of its {n} poses can be used: {poses.skips.first}"
+                )
+        return poses
+
+    def _remember(self, message: _Message, poses: _Poses) -> None:
+        topic, content = message.topic, message.content
+        if topic not in poses.tracks:
+            for sentence in poses.tree.add(content, topic.endswith(TF_STATIC)):
+                poses.skips.add("unusable_transform", sentence)
+            return
+        try:
+            T = checked_pose(*POSE_TYPES[message.kind](content))
+            poses.tracks[topic].add(message.stamp_ns, T)
+        except PoseError as error:
+            poses.skips.add("unusable_pose", f"{topic}: {error}")
+            return
+        if child := getattr(content, "child_frame_id", ""):
+            poses.child_frames.setdefault(topic, child)
 
     def _tf_topics(self) -> set[str]:
-        """Return the transform topics that are needed: the static ones, all for ground truth."""
-        tf = {t for t, kind in self.types.items() if kind in TF_TYPES}
-        return {t for t in tf if self._frames is not None or t.endswith(TF_STATIC)}
+        return {t for t, kind in self.types.items() if kind in TF_TYPES}
 
-    def _messages(self, topics: set[str]) -> Iterator[tuple[str, int, Any]]:
-        """Yield topic, stamp and message of the topics, in the order of recording."""
+    def _messages(
+        self, topics: set[str], skips: Skips | None = None, counts: Counter[str] | None = None
+    ) -> Iterator[_Message]:
+        """Yield the messages of the topics, in the order of recording.
+
+        skips: of those that cannot be read.  counts: of all of each topic.
+        """
         if not topics:
             return
-        with _one_sentence(self.path), self._reader() as reader:
+        with one_sentence(self.path), open_bag(self._parts) as reader:
             connections = [c for c in reader.connections if c.topic in topics]
             for connection, received_ns, raw in reader.messages(connections):
-                message: Any = reader.deserialize(raw, connection.msgtype)
-                stamp_ns = 0
-                if connection.msgtype not in TF_TYPES:
-                    stamp = message.header.stamp
-                    stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-                yield connection.topic, stamp_ns or int(received_ns), message
+                topic, kind = connection.topic, connection.msgtype
+                if counts is not None:
+                    counts[topic] += 1
+                try:
+                    content: Any = reader.deserialize(raw, kind)
+                except Exception as error:  # rosbags lets through what its parsers raise
+                    if skips is not None:
+                        skips.add("malformed", f"{topic}: a message {reason_in_words(error)}")
+                    continue
+                stamp_ns = 0 if kind in TF_TYPES else _stamp_ns(content)
+                yield _Message(topic, kind, stamp_ns or int(received_ns), content)
 
-    def _reader(self) -> AnyReader:
-        return AnyReader(self._parts, default_typestore=get_typestore(Stores.ROS2_JAZZY))
+
+def in_order(messages: Iterator[_Message], skips: Skips) -> Iterator[_Message]:
+    """Yield the messages whose stamps increase; count the others.
+
+    A stamp beyond those of the next two, which both follow what came before, is wrong itself.
+    """
+    before_ns: int | None = None
+    waiting: deque[_Message] = deque()
+    for message in messages:
+        waiting.append(message)
+        if len(waiting) == 3:
+            kept = _next(waiting, before_ns, skips)
+            if kept is not None:
+                before_ns = kept.stamp_ns
+                yield kept
+    while waiting:
+        if (kept := _next(waiting, before_ns, skips)) is not None:
+            before_ns = kept.stamp_ns
+            yield kept
 
 
-def _scan(message: Any, stamp_ns: int, law: TimeLaw | None) -> tuple[Scan, TimeLaw | None]:
-    """Return the scan of a message, and how its times were read: as the first said, if any."""
-    present = {field.name.lower(): field.name for field in reversed(message.fields)}
-    intensity = next((present[n] for n in INTENSITIES if n in present), None)
-    time = next((present[n] for n in NAMES if n in present), None)
-    wanted = tuple(name for name in (intensity, time) if name is not None)
-    fields = read_fields(message, ("x", "y", "z", *wanted))
-    points = np.stack([fields["x"], fields["y"], fields["z"]], axis=1).astype(np.float64)
-    if time is not None and law is None:
-        law = recognise(fields[time], stamp_ns)
-    scan = Scan(
-        stamp_ns=stamp_ns,
-        points=points,
-        intensity=None if intensity is None else fields[intensity].astype(np.float64),
-        time_s=None if law is None or time is None else relative_s(fields[time], law, stamp_ns),
+def _next(waiting: deque[_Message], before_ns: int | None, skips: Skips) -> _Message | None:
+    """Take the first of up to three messages; return it if it is in order."""
+    message = waiting.popleft()
+    now_ns = message.stamp_ns
+    where = f"the stamp {now_ns} of a cloud on {message.topic}"
+    if before_ns is not None and now_ns <= before_ns:
+        reason = "duplicate_stamp" if now_ns == before_ns else "out_of_order"
+        skips.add(reason, f"{where} does not follow {before_ns}")
+        return None
+    later = [other.stamp_ns for other in waiting]
+    floor_ns = -1 if before_ns is None else before_ns
+    if len(later) == 2 and all(floor_ns < other < now_ns for other in later):
+        skips.add("out_of_order", f"{where} is later than the next two")
+        return None
+    return message
+
+
+def _stamp_ns(content: Any) -> int:
+    stamp = content.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def _columns(message: _Message, clock: Clock) -> dict[str, NDArray[Any]]:
+    """Return x, y, z and, where known, intensity and time, each (N,), of a cloud message."""
+    if message.kind in livox.TYPES:
+        found = livox.read_livox(message.content)
+        return {
+            **{axis: found[axis] for axis in "xyz"},
+            "intensity": found["reflectivity"],
+            "time": found[livox.TIME],
+        }
+    names = [field.name for field in message.content.fields]
+    present = {name.lower(): name for name in reversed(names)}
+    wanted = {
+        "intensity": next((present[n] for n in INTENSITIES if n in present), None),
+        "time": clock.column(names),
+    }
+    used = {role: name for role, name in wanted.items() if name is not None}
+    fields = read_fields(message.content, ("x", "y", "z", *used.values()))
+    return {axis: fields[axis] for axis in "xyz"} | {r: fields[n] for r, n in used.items()}
+
+
+def _scan(message: _Message, law: TimeLaw | None, clock: Clock) -> Scan:
+    """Return the scan of a cloud message, without poses."""
+    found = _columns(message, clock)
+    intensity, time = found.get("intensity"), found.get("time")
+    time_s = None
+    if time is not None and law is not None:
+        time_s = relative_s(time, law, message.stamp_ns)
+    return Scan(
+        stamp_ns=message.stamp_ns + clock.offset_ns,
+        points=np.stack([found[axis] for axis in "xyz"], axis=1).astype(np.float64),
+        intensity=None if intensity is None else intensity.astype(np.float64),
+        time_s=time_s,
     )
-    return scan, law
-
-
-def _parts(path: Path) -> list[Path]:
-    """Return what to open: the path, or the files of a folder that rosbags would not know.
-
-    Such are bags that were split without metadata, and a rosbag2 named like a rosbag1, ``.bag``.
-    """
-    if path.is_dir() and (path.suffix == ".bag" or not (path / "metadata.yaml").exists()):
-        for ending in _ENDINGS:
-            if parts := sorted(path.glob(f"*{ending}")):
-                return parts
-    return [path]
-
-
-@contextmanager
-def _one_sentence(path: Path, where: str = "") -> Iterator[None]:
-    """Turn whatever a damaged bag raises into a RecordingError with the path.
-
-    rosbags parses untrusted bytes and lets through what its parsers raise (struct.error, KeyError,
-    AssertionError, sqlite3.Error, zstd's and lz4's errors, ...), so nothing narrower will do.
-    """
-    try:
-        yield
-    except FileNotFoundError as error:
-        what = "no such file or folder" if not path.exists() else "no metadata.yaml: not a rosbag2"
-        raise RecordingError(f"{path}: {where}{what}") from error
-    except Exception as error:
-        if isinstance(error, RecordingError) and str(error).startswith(f"{path}: "):
-            raise
-        lines = str(error).splitlines() or [type(error).__name__]
-        known = isinstance(error, Cello3dError)
-        text = lines[0] if known else f"cannot be read ({lines[0].rstrip('.')})"
-        raise RecordingError(f"{path}: {where}{text}") from error
-
-
-def _check_length(file: Path) -> None:
-    """Refuse an SQLite file shorter than its header says: SQLite reads the rest as zeros.
-
-    Source: SQLite database file format, bytes 16-17 (page size) and 28-31 (pages), big-endian.
-    """
-    with file.open("rb") as stream:
-        head = stream.read(32)
-    if head.startswith(b"SQLite format 3\0") and len(head) == 32:
-        page = int.from_bytes(head[16:18], "big")
-        declared = (65536 if page == 1 else page) * int.from_bytes(head[28:32], "big")
-        if file.stat().st_size < declared:
-            raise RecordingError(f"{file.name} has lost its end: {declared} bytes are declared")

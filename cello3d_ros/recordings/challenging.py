@@ -13,13 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cello3d_ros.clouds.point_times import PointTimesError, TimeLaw, recognise
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings import tables
 from cello3d_ros.recordings.archives import Files
-from cello3d_ros.recordings.files import checked, scan_of
+from cello3d_ros.recordings.files import checked, scan_of, times_of
 from cello3d_ros.recordings.poses import check_order, rigid, seconds_to_ns
 from cello3d_ros.recordings.recording import Scan
 
@@ -67,6 +68,7 @@ class ChallengingRecording:
     """
 
     has_odometry = False
+    times = ""  # the sensor stands still during each scan
 
     def __init__(self, path: Path | str) -> None:
         """Read the poses.  Raises RecordingError."""
@@ -90,6 +92,16 @@ class ChallengingRecording:
     def n_projected(self) -> int:
         """How many poses were not quite rigid and were made so."""
         return 0 if self._poses is None else self._poses.n_projected
+
+    @property
+    def n_declared(self) -> int:
+        """How many scans there are."""
+        return len(self._clouds)
+
+    @property
+    def skipped(self) -> dict[str, int]:
+        """Nothing: a scan that cannot be read is an error."""
+        return {}
 
     def __len__(self) -> int:
         return len(self._clouds)
@@ -119,7 +131,7 @@ class ChallengingRecording:
         if not self._local and T is not None:
             moved = se3.transform(se3.inverse(T), np.stack([found[a] for a in "xyz"], axis=1))
             found |= dict(zip("xyz", moved.T, strict=True))
-        scan = scan_of(found, stamp_ns, where)
+        scan = scan_of(found, stamp_ns, where, _law(found, stamp_ns))
         return Scan(**{**vars(scan), "T_world_sensor": T})
 
     def _read_poses(self, beside: PurePosixPath) -> _PoseFile | None:
@@ -183,6 +195,16 @@ def _read_pose_file(files: Files, name: str) -> _PoseFile:
         words = [line.replace(";", ",").split(",")[at].strip() for line in lines]
         stamps = check_order([seconds_to_ns(word, where) for word in words], where)
     return _PoseFile([int(i) for i in ids], stamps, poses.T, poses.n_projected)
+
+
+def _law(found: dict[str, Array], stamp_ns: int) -> TimeLaw | None:
+    times = times_of(found)
+    if times is None:
+        return None
+    try:
+        return recognise(times, stamp_ns)
+    except PointTimesError:
+        return None
 
 
 def _first_ns(found: dict[str, Array], where: str) -> int:

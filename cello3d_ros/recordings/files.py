@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from itertools import combinations, islice
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -11,13 +12,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cello3d_ros.clouds.point_times import INTENSITIES, NAMES, TimeLaw, recognise, relative_s
+from cello3d_ros.clouds.point_times import (
+    INTENSITIES,
+    Clock,
+    TimeLaw,
+    law_of,
+    relative_s,
+)
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings import pcd, ply, tables
-from cello3d_ros.recordings.recording import Scan
+from cello3d_ros.recordings.recording import LenientRecording, Scan, Skips
 
 Columns = dict[str, NDArray[Any]]
+
+_OWN = Clock()
+_N_FIRST = 10  # clouds from which it is seen how times are to be read
 
 
 _DAMAGE = (  # what numpy's reader of headers lets through, and allocations of damaged sizes
@@ -36,9 +46,10 @@ _DAMAGE = (  # what numpy's reader of headers lets through, and allocations of d
 def read_cloud(path: Path | str) -> Array:
     """Return the finite points (N, 3) of a file, N > 0, metres; the ending tells the format.
 
-    ``.bin``: float32 little-endian rows x, y, z, intensity (KITTI).  ``.npy``: an array (N, 3) or
-    wider, x, y, z first, or one with named fields.  ``.csv``: a header line with columns x, y, z
-    anywhere, separated by commas, semicolons or blanks.  ``.ply``, ``.pcd``: ASCII or binary.
+    ``.bin``: float32 little-endian rows x, y, z, intensity (KITTI), also with a ring (nuScenes).
+    ``.npy``: an array (N, 3) or wider, x, y, z first, or one with named fields.  ``.csv``: a
+    header line with columns x, y, z anywhere, separated by commas, semicolons or blanks.
+    ``.ply``, ``.pcd``: ASCII or binary.
     Raises RecordingError that says what is wrong with the file.
     """
     return scan_of(read_columns(path), 0, path).points
@@ -59,11 +70,16 @@ def read_columns(path: Path | str) -> Columns:
         raise RecordingError(f"{path}: cannot be read ({reason})") from error
 
 
-def scan_of(found: Columns, stamp_ns: int, where: object, law: TimeLaw | None = None) -> Scan:
+def scan_of(
+    found: Columns,
+    stamp_ns: int,
+    where: object,
+    law: TimeLaw | None = None,
+    clock: Clock = _OWN,
+) -> Scan:
     """Return the finite points as a scan, with the intensities and times that there are.
 
-    law: how to read times; recognised from this scan if None.  Raises RecordingError when no
-    point is finite.
+    law: how to read times; None leaves them out.  Raises RecordingError when no point is finite.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         points = np.stack([found[axis].astype(np.float64) for axis in "xyz"], axis=1)
@@ -71,27 +87,93 @@ def scan_of(found: Columns, stamp_ns: int, where: object, law: TimeLaw | None = 
     if not finite.any():
         raise RecordingError(f"{where}: holds no finite point")
     kept = {name: values[finite] for name, values in found.items()}
-    intensity, times = companions(kept)
-    law = law or (None if times is None else recognise(times, stamp_ns))
+    intensity = next((kept[name] for name in INTENSITIES if name in kept), None)
+    times = None if law is None else times_of(kept, clock)
     return Scan(
-        stamp_ns=stamp_ns,
+        stamp_ns=stamp_ns + clock.offset_ns,
         points=points[finite],
         intensity=None if intensity is None else intensity.astype(np.float64),
         time_s=None if times is None or law is None else relative_s(times, law, stamp_ns),
     )
 
 
-def companions(found: Columns) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
-    """Return the columns of intensity and of time, None where there is none."""
-    intensity = next((found[name] for name in INTENSITIES if name in found), None)
-    return intensity, next((found[name] for name in NAMES if name in found), None)
+def times_of(found: Columns, clock: Clock = _OWN) -> NDArray[Any] | None:
+    """Return the column of times, None where there is none.  Raises PointTimesError."""
+    name = clock.column(found)
+    return None if name is None else found[name]
+
+
+class CloudFiles(LenientRecording):
+    """Clouds in files of their own; what is known of their poses is for those who build on it."""
+
+    files: Sequence[Path]
+    stamps_ns: Sequence[int]
+
+    @property
+    def n_declared(self) -> int:
+        """How many files there are."""
+        return len(self.files)
+
+    def _clouds(self, skips: Skips) -> Iterator[tuple[int, Scan]]:
+        """Yield the number of each file and its scan without poses."""
+        law, _ = self._times
+        for k, (file, stamp_ns) in enumerate(zip(self.files, self.stamps_ns, strict=True)):
+            try:
+                yield k, scan_of(read_columns(file), stamp_ns, file, law, self._clock)
+            except RecordingError as error:
+                if self._strict:
+                    raise
+                skips.add("malformed", str(error))
+
+    def _law(self) -> TimeLaw | None:
+        first = []
+        for file, stamp_ns in islice(zip(self.files, self.stamps_ns, strict=True), _N_FIRST):
+            try:
+                times = times_of(read_columns(file), self._clock)
+            except RecordingError:
+                continue
+            if times is None:
+                return None
+            first.append((times, stamp_ns))
+        return law_of(first, self._clock.unit)
 
 
 def _read_bin(data: bytes, path: Path) -> Columns:
-    if len(data) % 16:
-        raise RecordingError(f"{path}: {len(data)} bytes are no whole number of 16-byte points")
-    rows = np.frombuffer(data, dtype="<f4").reshape(-1, 4)
-    return dict(zip(("x", "y", "z", "intensity"), rows.T, strict=True))
+    """Read rows of 4 float32 (KITTI), or of 5 (nuScenes, ``.pcd.bin``)."""
+    values = np.frombuffer(data[: len(data) // 4 * 4], dtype="<f4")
+    n = _n_columns(values, 5 if path.name.lower().endswith(".pcd.bin") else 4)
+    if len(data) % (4 * n):
+        raise RecordingError(
+            f"{path}: {len(data)} bytes are no whole number of {4 * n}-byte points"
+        )
+    if n not in (4, 5):
+        raise RecordingError(
+            f"{path}: looks like {n} numbers a point; 4 (KITTI) and 5 (nuScenes) are read"
+        )
+    return dict(zip(("x", "y", "z", "intensity", "ring"), values.reshape(-1, n).T))
+
+
+def _n_columns(values: NDArray[np.float32], usual: int) -> int:
+    """Return how many numbers a point has, the usual number if another is not much likelier.
+
+    Read with a wrong number each column is a mixture of the true ones: the greatest difference
+    between the distributions of two columns is never above that of the true columns.
+    """
+    scores = {n: _difference(values, n) for n in (4, 5, 3, 6)}
+    best = max(scores, key=lambda n: scores[n])
+    margin = 0.15 + 3.0 / np.sqrt(max(len(values) / usual, 1))
+    return best if scores[best] > scores[usual] + margin else usual
+
+
+def _difference(values: NDArray[np.float32], n_columns: int) -> float:
+    """Return the greatest Kolmogorov-Smirnov distance between columns, of at most 2000 rows."""
+    rows = values[: len(values) // n_columns * n_columns].reshape(-1, n_columns)
+    rows = np.sort(rows[:: max(1, len(rows) // 2000)], axis=0)
+    if len(rows) < 100 or not np.isfinite(rows).all():
+        return 0.0
+    at = np.sort(rows.ravel())
+    shares = [np.searchsorted(column, at, side="right") / len(rows) for column in rows.T]
+    return max(float(np.abs(a - b).max()) for a, b in combinations(shares, 2))
 
 
 def _read_npy(data: bytes, path: Path) -> Columns:

@@ -10,20 +10,19 @@ from pathlib import Path
 import numpy as np
 
 from cello3d_ros.errors import RecordingError
-from cello3d_ros.geometry.pose_track import PoseError, PoseTrack
+from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings import tables
-from cello3d_ros.recordings.files import READERS, read_columns, scan_of
+from cello3d_ros.recordings.files import READERS, CloudFiles
 from cello3d_ros.recordings.kitti import STEP_NS
 from cello3d_ros.recordings.poses import (
-    StampedRows,
     check_order,
-    read_tum,
-    rigid,
+    read_poses,
+    read_track,
     seconds_to_ns,
     stamps_of,
 )
-from cello3d_ros.recordings.recording import Scan
+from cello3d_ros.recordings.recording import ReadOptions, Scan
 
 TRUTH = (
     "ground_truth.tum", "groundtruth.tum", "poses.tum", "poses.txt",
@@ -31,36 +30,40 @@ TRUTH = (
 )  # fmt: skip
 ODOMETRY, TIMES = "odometry.tum", "times.txt"
 _NOT_CLOUDS = ("pose_scanner_leica.csv",)
-_NEAR_NS = 1_000_000  # a stamp this far outside the poses still has the first or last of them
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?)$")
 
 
-class FolderRecording:
+class FolderRecording(CloudFiles):
     """Clouds in the order of the numbers in their names.
 
     Stamps: times.txt (seconds, one a row), else names that are times (seconds with a decimal
-    point; or integers of seconds, us or ns), else the rows of a TUM file with as many poses as
-    there are clouds, else 0.1 s apart.  Poses: the file named, else ``ground_truth.tum``,
-    ``poses.txt`` or the like; KITTI rows belong to clouds by order, TUM rows by stamp (linear and
-    SLERP between two), or by order where nothing else gives stamps.
+    point; or integers of seconds, us or ns), else the rows of a TUM file of ground truth or
+    odometry with as many poses as there are clouds, else 0.1 s apart.  Poses: the file named,
+    else ``ground_truth.tum``, ``poses.txt`` or the like; KITTI rows belong to clouds by order, TUM
+    rows by stamp (linear and SLERP between two), or by order where nothing else gives stamps.
     """
 
-    def __init__(self, folder: Path | str, poses: Path | str | None = None) -> None:
+    def __init__(self, folder: Path | str, options: ReadOptions | None = None) -> None:
         """Read everything but the clouds.  Raises RecordingError."""
         self.folder = Path(folder)
-        self._files = clouds_in(self.folder)
-        if not self._files:
+        options = options or ReadOptions()
+        super().__init__(self.folder, options)
+        self.files = clouds_in(self.folder)
+        if not self.files:
             raise RecordingError(f"{folder}: has no cloud ({', '.join(READERS)})")
         self.n_projected = 0
-        self._stamps_ns = self._known_stamps()
-        file = Path(poses) if poses is not None else self._usual()
-        self._truth: PoseTrack | list[Array] | None = None
+        self._truth: PoseTrack | Array | None = None
+        self._odometry: PoseTrack | None = None
+        file, odometry = options.poses or self._usual(), self.folder / ODOMETRY
         if file is not None:
-            self._truth = self._read_poses(file)
-        if self._stamps_ns is None:
-            self._stamps_ns = [k * STEP_NS for k in range(len(self._files))]
-        self._odometry = self._tum(self.folder / ODOMETRY)
-        self._check_poses(file)
+            self._truth, self.n_projected = read_poses(file)
+            if not isinstance(self._truth, PoseTrack):
+                self._check_count(file, len(self._truth))
+        if odometry.is_file():
+            self._odometry = read_track(odometry)
+        self.stamps_ns = self._stamps(file)
+        self._check_covered(file, self._truth)
+        self._check_covered(odometry, self._odometry)
 
     @property
     def name(self) -> str:
@@ -72,72 +75,62 @@ class FolderRecording:
         """Whether there is an ``odometry.tum``."""
         return self._odometry is not None
 
-    def __len__(self) -> int:
-        return len(self._files)
-
     def __iter__(self) -> Iterator[Scan]:
-        assert self._stamps_ns is not None
-        for k, (file, stamp_ns) in enumerate(zip(self._files, self._stamps_ns, strict=True)):
+        for k, scan in self._kept():
+            odometry = self._odometry
             yield replace(
-                scan_of(read_columns(file), stamp_ns, file),
-                T_world_sensor=self._pose(k, stamp_ns),
-                T_odom_sensor=None if self._odometry is None else _near(self._odometry, stamp_ns),
+                scan,
+                T_world_sensor=self._pose(k, scan.stamp_ns),
+                T_odom_sensor=None if odometry is None else odometry.near(scan.stamp_ns),
             )
 
     def track(self) -> PoseTrack | None:
         """Return the odometry, else the ground truth."""
-        if self._odometry is not None or not isinstance(self._truth, list):
-            return self._odometry or self._truth  # type: ignore[return-value]
-        return PoseTrack.of_poses(self._stamps_ns or [], np.stack(self._truth))
+        if self._odometry is not None or self._truth is None:
+            return self._odometry
+        if isinstance(self._truth, PoseTrack):
+            return self._truth
+        stamps_ns = np.array(self.stamps_ns) + self._clock.offset_ns
+        return PoseTrack.of_poses(stamps_ns, self._truth)
 
     def _pose(self, k: int, stamp_ns: int) -> Array | None:
-        if isinstance(self._truth, list):
-            return self._truth[k].copy()
-        return None if self._truth is None else _near(self._truth, stamp_ns)
+        if isinstance(self._truth, PoseTrack):
+            return self._truth.near(stamp_ns)
+        return None if self._truth is None else self._truth[k].copy()
+
+    def _stamps(self, file: Path | None) -> list[int]:
+        """Return the stamps of the clouds, from the first source that there is."""
+        if (known := self._known_stamps()) is not None:
+            return known
+        for path, poses in ((file, self._truth), (self.folder / ODOMETRY, self._odometry)):
+            if path is not None and isinstance(poses, PoseTrack):
+                stamps = stamps_of(tables.read_bytes(path), path)
+                self._check_count(path, len(stamps))
+                return check_order(stamps, path)
+        return [k * STEP_NS for k in range(len(self.files))]
 
     def _known_stamps(self) -> list[int] | None:
         times = self.folder / TIMES
         if times.exists():
             stamps = stamps_of(tables.read_bytes(times), times)
-            if len(stamps) != len(self._files):
+            if len(stamps) != len(self.files):
                 raise RecordingError(
-                    f"{times}: has {len(stamps)} rows for {len(self._files)} clouds"
+                    f"{times}: has {len(stamps)} rows for {len(self.files)} clouds"
                 )
             return check_order(stamps, times)
-        named = [_named_stamp(file) for file in self._files]
+        named = [_named_stamp(file) for file in self.files]
         return [s for s in named if s is not None] if None not in named else None
 
     def _usual(self) -> Path | None:
         return next((p for name in TRUTH if (p := self.folder / name).is_file()), None)
 
-    def _tum(self, path: Path) -> PoseTrack | None:
-        if not path.is_file():
-            return None
-        return _track(read_tum(tables.read_bytes(path), path), path)
-
-    def _read_poses(self, path: Path) -> PoseTrack | list[Array]:
-        data = tables.read_bytes(path)
-        if _n_columns(data) != 8:
-            rows = tables.numbers(data, 12, path)
-            self._check_count(path, len(rows))
-            poses = rigid(rows.reshape(-1, 3, 4), path)
-            self.n_projected = poses.n_projected
-            return list(poses.T)
-        found = read_tum(data, path)
-        if self._stamps_ns is None:
-            self._check_count(path, len(found.stamps_ns))
-            self._stamps_ns = check_order(found.stamps_ns, path)
-        return _track(found, path)
-
     def _check_count(self, path: Path, n_rows: int) -> None:
-        if n_rows != len(self._files):
-            raise RecordingError(f"{path}: has {n_rows} poses for {len(self._files)} clouds")
+        if n_rows != len(self.files):
+            raise RecordingError(f"{path}: has {n_rows} poses for {len(self.files)} clouds")
 
-    def _check_poses(self, path: Path | None) -> None:
-        truth = self._truth
-        if isinstance(truth, PoseTrack) and not any(
-            _near(truth, stamp_ns) is not None for stamp_ns in self._stamps_ns or []
-        ):
+    def _check_covered(self, path: Path | None, poses: PoseTrack | Array | None) -> None:
+        stamps_ns = (stamp_ns + self._clock.offset_ns for stamp_ns in self.stamps_ns)
+        if isinstance(poses, PoseTrack) and all(poses.near(t) is None for t in stamps_ns):
             raise RecordingError(f"{path}: no pose has the time of any cloud")
 
 
@@ -158,7 +151,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 def _named_stamp(file: Path) -> int | None:
     """Return the stamp that is a file's name, None if the name is no time."""
-    found = _NUMBER.search(file.stem)
+    found = _NUMBER.search(file.stem.removesuffix(".pcd"))  # as in nuScenes' .pcd.bin
     if found is None:
         return None
     text = found[1]
@@ -167,25 +160,3 @@ def _named_stamp(file: Path) -> int | None:
     if len(text) >= 18:
         return int(text)
     return int(text) * 1000 if len(text) >= 15 else None
-
-
-def _track(found: StampedRows, path: Path) -> PoseTrack:
-    try:
-        return PoseTrack.of_rows(*found)
-    except PoseError as error:
-        raise RecordingError(f"{path}: {error}") from None
-
-
-def _near(track: PoseTrack, stamp_ns: int) -> Array | None:
-    """Return the pose at a stamp, or the first or last of the track when just outside of it."""
-    if len(track) == 0:
-        return None
-    first, last = int(track.stamps_ns[0]), int(track.stamps_ns[-1])
-    if first - _NEAR_NS <= stamp_ns <= last + _NEAR_NS:
-        return track.at(min(max(stamp_ns, first), last))
-    return None
-
-
-def _n_columns(data: bytes) -> int:
-    lines = (line.split(b"#")[0].split() for line in data.splitlines())
-    return next((len(words) for words in lines if words), 0)

@@ -12,7 +12,7 @@ from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.recordings.recording import Recording, Scan
+from cello3d_ros.recordings.recording import DerivedRecording, Recording, Scan
 
 
 def drift_odometry(
@@ -45,30 +45,21 @@ def drift_odometry(
     return np.stack(out)
 
 
-class SimulatedOdometry:
+class SimulatedOdometry(DerivedRecording):
     """A recording whose odometry is its ground truth made to drift; its own is not looked at.
 
     A scan without ground truth has no odometry.
     """
 
-    has_odometry = True
-
     def __init__(self, recording: Recording, seed: int = 0) -> None:
         """seed: of the drift.  Nothing is read yet."""
-        self.recording, self._seed = recording, seed
+        super().__init__(recording)
+        self._seed = seed
 
     @property
-    def name(self) -> str:
-        """Name of the recording."""
-        return self.recording.name
-
-    @property
-    def n_projected(self) -> int:
-        """As of the recording."""
-        return self.recording.n_projected
-
-    def __len__(self) -> int:
-        return len(self.recording)
+    def has_odometry(self) -> bool:
+        """True: it is simulated."""
+        return True
 
     def __iter__(self) -> Iterator[Scan]:
         drifted = iter(self._drifted()[1])

@@ -3,36 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from cello3d_ros.errors import RecordingError
+from cello3d_ros.recordings.recording import ReadOptions, Recording
 
-if TYPE_CHECKING:
-    from cello3d_ros.geometry.se3 import Array
-    from cello3d_ros.recordings.recording import Recording
-
-_BAGS = (".bag", ".mcap", ".db3")
+_BAGS = (".bag", ".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 
 
-def open_recording(
-    path: Path | str,
-    points_topic: str | None = None,
-    odometry_topic: str | None = None,
-    ground_truth_topic: str | None = None,
-    *,
-    ground_truth_frames: tuple[str, str] | None = None,
-    T_base_sensor: Array | None = None,
-    poses: Path | str | None = None,
-) -> Recording:
+def open_recording(path: Path | str, options: ReadOptions | None = None) -> Recording:
     """Return the recording at a path, whatever it is.
 
     A KITTI folder (it has ``velodyne/``), a ROS bag, the 'Challenging data sets' (a folder or zip
-    archive with ``Hokuyo_<i>.csv``), or a folder of clouds.  Topics, frames and T_base_sensor are
-    for bags, see BagRecording; ``poses`` is for folders of clouds.  Raises RecordingError.
+    archive with ``Hokuyo_<i>.csv``), or a folder of clouds.  options: what a user says of it.
+    Raises RecordingError.
     """
-    path = Path(path)
-    topics = (points_topic, odometry_topic, ground_truth_topic)
-    bag_options = any(topics) or ground_truth_frames is not None or T_base_sensor is not None
+    path, options = Path(path), options or ReadOptions()
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder")
     kind = kind_of(path)
@@ -42,24 +27,30 @@ def open_recording(
             ".db3 file, a KITTI folder (velodyne/), a folder or zip archive with Hokuyo_<i>.csv, "
             "or a folder of .ply, .pcd, .bin, .npy or .csv clouds"
         )
-    if kind != "ROS bag" and bag_options:
+    if kind != "ROS bag" and options.is_for_bags:
         raise RecordingError(f"{path}: a {kind} has no topics to choose from")
-    if kind != "folder of clouds" and poses is not None:
-        raise RecordingError(f"{path}: a {kind} has poses of its own")
-    if kind == "KITTI folder":
-        from cello3d_ros.recordings.kitti import KittiRecording
-
-        return KittiRecording(path)
-    if kind == "ROS bag":
-        from cello3d_ros.recordings.bag import BagRecording
-
-        return BagRecording(
-            path, *topics, ground_truth_frames=ground_truth_frames, T_base_sensor=T_base_sensor
-        )
     if kind == "folder of clouds":
         from cello3d_ros.recordings.folder import FolderRecording
 
-        return FolderRecording(path, poses)
+        return FolderRecording(path, options)
+    recording = _recording(path, kind, options)
+    if options.poses is None:
+        return recording
+    from cello3d_ros.recordings.start_poses import PosedRecording, start_track
+
+    track = start_track(options.poses, recording)
+    return PosedRecording(recording, track, keeps_odometry=True)
+
+
+def _recording(path: Path, kind: str, options: ReadOptions) -> Recording:
+    if kind == "KITTI folder":
+        from cello3d_ros.recordings.kitti import KittiRecording
+
+        return KittiRecording(path, options)
+    if kind == "ROS bag":
+        from cello3d_ros.recordings.bag import BagRecording
+
+        return BagRecording(path, options)
     from cello3d_ros.recordings.challenging import ChallengingRecording
 
     return ChallengingRecording(path)
@@ -72,9 +63,9 @@ def kind_of(path: Path) -> str | None:
     """
     if (path / "velodyne").is_dir():
         return "KITTI folder"
-    if path.suffix in _BAGS or (path / "metadata.yaml").exists():
+    if path.name.endswith(_BAGS) or (path / "metadata.yaml").exists():
         return "ROS bag"
-    if path.is_dir() and any(f.suffix in _BAGS for f in path.iterdir()):
+    if path.is_dir() and any(f.name.endswith(_BAGS) for f in path.iterdir()):
         return "ROS bag"
     if path.is_dir() or path.suffix.lower() == ".zip":
         from cello3d_ros.recordings.challenging import is_challenging

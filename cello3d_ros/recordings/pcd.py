@@ -29,7 +29,7 @@ def read(data: bytes, where: object) -> dict[str, NDArray[Any]]:
         dtypes = [np.dtype(f"<{kind}{size}") for _, size, kind, _ in fields]
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise RecordingError(f"{where}: its header is damaged ({error})") from error
-    if n < 0 or min(counts) < 1 or sum(c * s for c, s in zip(counts, sizes)) > 65536:
+    if n < 0 or not counts or min(counts) < 0 or sum(c * s for c, s in zip(counts, sizes)) > 65536:
         raise RecordingError(f"{where}: its header is damaged (POINTS or COUNT)")
     bodies = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}
     if encoding not in bodies:
@@ -72,7 +72,7 @@ def _ascii(
 def _binary(
     body: bytes, n: int, dtypes: list[np.dtype[Any]], counts: list[int], where: object
 ) -> Found:
-    row = np.dtype([(f"f{k}", d, (c,)) for k, (d, c) in enumerate(zip(dtypes, counts))])
+    row = np.dtype([(f"f{k}", d, (c,)) for k, (d, c) in enumerate(zip(dtypes, counts)) if c])
     if len(body) < n * row.itemsize:
         raise RecordingError(f"{where}: declares {n * row.itemsize} bytes, holds {len(body)}")
     rows = np.frombuffer(body[: n * row.itemsize], row)

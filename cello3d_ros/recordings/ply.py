@@ -25,31 +25,47 @@ _NAMES = {"f4": "float", "f8": "double"}
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
+class _Property(NamedTuple):
+    """A number of each row, or a list of numbers whose length comes first.  kind: numpy's."""
+
+    name: str
+    kind: str
+    length: str = ""  # kind of the length of a list
+
+
+class _Element(NamedTuple):
+    name: str
+    n_rows: int
+    properties: list[_Property]
+
+    @property
+    def has_lists(self) -> bool:
+        return any(p.length for p in self.properties)
+
+
 class _Header(NamedTuple):
     encoding: str
-    n_vertices: int
-    properties: list[tuple[str, str]]
+    elements: list[_Element]
     body: bytes
 
 
 def read(data: bytes, where: object) -> dict[str, NDArray[Any]]:
     """Return the properties of the vertices, each (N,), by lower-case names.
 
-    The vertices must come first, as they do from all common programs; other elements (faces) are
-    left unread.  Raises RecordingError.
+    Lists and other elements (faces) are left out.  Raises RecordingError.
     """
     header = _header(data, where)
-    order = _ORDERS[header.encoding]
-    dtype = np.dtype([(name, order + kind) for name, kind in header.properties])
-    if header.encoding == "ascii":
-        return _ascii(header, where)
-    size = header.n_vertices * dtype.itemsize
-    if len(header.body) < size:
-        raise RecordingError(f"{where}: declares {size} bytes but holds {len(header.body)}")
-    rows = np.frombuffer(header.body[:size], dtype)
-    return {
-        name: rows[name].astype(dtype[name].newbyteorder("=")) for name, _ in header.properties
-    }
+    words = header.body.split() if header.encoding == "ascii" else []
+    at = 0
+    for element in header.elements:
+        if header.encoding == "ascii":
+            found, at = _ascii(element, words, at, where)
+        else:
+            order = _ORDERS[header.encoding]
+            found, at = _binary(element, header.body, at, order, where)
+        if element.name == "vertex":
+            return found
+    raise AssertionError("unreachable")
 
 
 def write(path: Path, found: dict[str, NDArray[Any]]) -> None:
@@ -70,34 +86,99 @@ def _header(data: bytes, where: object) -> _Header:
         raise RecordingError(f"{where}: is no PLY file, or its header is cut")
     lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()]
     encoding = next((words[1] for words in lines if words[:1] == ["format"] and words[1:]), "")
-    elements = [k for k, words in enumerate(lines) if words[:1] == ["element"]]
-    if encoding not in _ORDERS or not elements or lines[elements[0]][1:2] != ["vertex"]:
-        raise RecordingError(f"{where}: expected a format and the vertices as first element")
     try:
-        n_vertices = int(lines[elements[0]][2])
-        body = takewhile(lambda words: words[:1] != ["element"], lines[elements[0] + 1 :])
-        pairs = [(w[2].lower(), _TYPES[w[1]]) for w in body if w[:1] == ["property"]]
+        starts = [k for k, words in enumerate(lines) if words[:1] == ["element"]]
+        elements = [_element(lines[k:]) for k in starts]
     except (ValueError, IndexError, KeyError) as error:
         raise RecordingError(f"{where}: its header is damaged ({error})") from error
-    if n_vertices < 0 or not pairs or len({name for name, _ in pairs}) < len(pairs):
-        raise RecordingError(f"{where}: its header is damaged (vertices and properties)")
-    return _Header(encoding, n_vertices, pairs, data[newline + 1 :])
+    if encoding not in _ORDERS or "vertex" not in (element.name for element in elements):
+        raise RecordingError(f"{where}: expected a format and vertices")
+    for element in elements:
+        names = {p.name for p in element.properties}
+        if element.n_rows < 0 or not names or len(names) < len(element.properties):
+            raise RecordingError(f"{where}: its header is damaged ({element.name})")
+    return _Header(encoding, elements, data[newline + 1 :])
 
 
-def _ascii(header: _Header, where: object) -> dict[str, NDArray[Any]]:
-    n = header.n_vertices * len(header.properties)
-    words = header.body.split(maxsplit=n)[:n]
-    if len(words) < n:
-        raise RecordingError(f"{where}: declares {n} numbers but holds {len(words)}")
+def _element(lines: list[list[str]]) -> _Element:
+    properties = []
+    for words in takewhile(lambda words: words[:1] != ["element"], lines[1:]):
+        if words[:2] == ["property", "list"]:
+            properties.append(_Property(words[4].lower(), _TYPES[words[3]], _TYPES[words[2]]))
+        elif words[:1] == ["property"]:
+            properties.append(_Property(words[2].lower(), _TYPES[words[1]]))
+    return _Element(lines[0][1], int(lines[0][2]), properties)
+
+
+def _binary(
+    element: _Element, body: bytes, at: int, order: str, where: object
+) -> tuple[dict[str, NDArray[Any]], int]:
+    """Return the columns of an element and where the next begins."""
+    if element.has_lists:
+        return _binary_with_lists(element, body, at, order, where)
+    dtype = np.dtype([(p.name, order + p.kind) for p in element.properties])
+    end = at + element.n_rows * dtype.itemsize
+    if len(body) < end:
+        raise RecordingError(f"{where}: declares {end} bytes but holds {len(body)}")
+    rows = np.frombuffer(body[at:end], dtype)
+    return {n: rows[n].astype(dtype[n].newbyteorder("=")) for n in dtype.names or ()}, end
+
+
+def _binary_with_lists(
+    element: _Element, body: bytes, at: int, order: str, where: object
+) -> tuple[dict[str, NDArray[Any]], int]:
+    """Read row by row: only the lengths of the lists tell where the next begins."""
+    plain = [p for p in element.properties if not p.length]
+    dtype = np.dtype([(p.name, order + p.kind) for p in plain])
+    packed = bytearray()
+    for _ in range(element.n_rows):
+        for p in element.properties:
+            size = int(p.kind[1:])
+            if p.length:
+                end = at + int(p.length[1:])
+                length = np.frombuffer(body[at:end].ljust(end - at, b"\0"), order + p.length)
+                at, size = end, size * max(int(length[0]), 0)
+            else:
+                packed += body[at : at + size]
+            at += size
+        if at > len(body):
+            raise RecordingError(f"{where}: declares more rows than it holds")
+    rows = np.frombuffer(bytes(packed), dtype) if plain else np.empty(0, dtype)
+    return {n: rows[n].astype(dtype[n].newbyteorder("=")) for n in dtype.names or ()}, at
+
+
+def _ascii(
+    element: _Element, words: list[bytes], at: int, where: object
+) -> tuple[dict[str, NDArray[Any]], int]:
+    """Return the columns of an element and the number of the word after it."""
+    plain = [p for p in element.properties if not p.length]
+    end = at + element.n_rows * len(element.properties)
     try:
-        rows = np.array(words, dtype=np.float64).reshape(header.n_vertices, -1)
-    except ValueError as error:
-        raise RecordingError(f"{where}: cannot be read ({error})") from error
-    return {
-        name: rows[:, k]
-        if kind == "f8"
-        else rows[:, k].astype(np.float32)
-        if kind == "f4"
-        else rows[:, k]
-        for k, (name, kind) in enumerate(header.properties)
+        if element.has_lists:
+            rows, end = _ascii_with_lists(element, words, at)
+        else:
+            rows = np.array(words[at:end], dtype=np.float64)
+        table = rows.reshape(element.n_rows, len(plain))
+    except (ValueError, IndexError, OverflowError) as error:
+        raise RecordingError(
+            f"{where}: declares {element.n_rows} rows of numbers but holds others ({error})"
+        ) from error
+    found = {
+        p.name: table[:, k].astype(np.float32) if p.kind == "f4" else table[:, k]
+        for k, p in enumerate(plain)
     }
+    return found, end
+
+
+def _ascii_with_lists(
+    element: _Element, words: list[bytes], at: int
+) -> tuple[NDArray[np.float64], int]:
+    kept: list[float] = []
+    for _ in range(element.n_rows):
+        for p in element.properties:
+            if p.length:
+                at += 1 + int(words[at])
+            else:
+                kept.append(float(words[at]))
+                at += 1
+    return np.array(kept, dtype=np.float64), at

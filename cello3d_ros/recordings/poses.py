@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from decimal import Decimal, InvalidOperation
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.pose_track import PoseError, PoseTrack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings import tables
 
@@ -77,6 +79,31 @@ def seconds_to_ns(text: str, where: object) -> int:
     except InvalidOperation:
         pass
     raise RecordingError(f"{where}: {text[:40]!r} is not a time in seconds")
+
+
+def read_poses(path: Path) -> tuple[PoseTrack | Array, int]:
+    """Return the poses of a file, and how many were not quite rigid and were made so.
+
+    Rows of 8 numbers are TUM's, a track over time; rows of 12 KITTI's, (n, 4, 4) without times.
+    Raises RecordingError.
+    """
+    data = tables.read_bytes(path)
+    words = (line.split(b"#")[0].split() for line in data.splitlines())
+    if len(next((row for row in words if row), [])) == 8:
+        return _track(data, path), 0
+    return rigid(tables.numbers(data, 12, path).reshape(-1, 3, 4), path)
+
+
+def read_track(path: Path) -> PoseTrack:
+    """Return the poses of a TUM file.  Raises RecordingError."""
+    return _track(tables.read_bytes(path), path)
+
+
+def _track(data: bytes, path: Path) -> PoseTrack:
+    try:
+        return PoseTrack.of_rows(*read_tum(data, path))
+    except PoseError as error:
+        raise RecordingError(f"{path}: {error}") from None
 
 
 def check_order(stamps_ns: list[int], where: object) -> list[int]:

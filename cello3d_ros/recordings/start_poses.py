@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.pose_track import PoseTrack
-from cello3d_ros.recordings import tables
-from cello3d_ros.recordings.poses import read_tum, rigid
-from cello3d_ros.recordings.recording import Recording, Scan
+from cello3d_ros.recordings.poses import read_poses
+from cello3d_ros.recordings.recording import DerivedRecording, Recording, Scan
 
 
 def start_track(path: Path, recording: Recording) -> PoseTrack:
@@ -19,42 +18,40 @@ def start_track(path: Path, recording: Recording) -> PoseTrack:
     Between two poses farther apart than ``pose_track.GAP_S`` there is none.  Raises RecordingError
     where no scan has a pose.
     """
-    data = tables.read_bytes(path)
-    words = next((line.split() for line in data.splitlines() if line.split(b"#")[0].strip()), [])
-    if len(words) == 12:
-        T = rigid(tables.numbers(data, 12, path).reshape(-1, 3, 4), path).T
-        if len(T) != len(recording):
-            raise RecordingError(f"{path}: has {len(T)} poses for {len(recording)} scans")
-        return PoseTrack.of_poses([scan.stamp_ns for scan in recording], T)
-    track = PoseTrack.of_rows(*read_tum(data, path))
-    if all(track.at(scan.stamp_ns) is None for scan in recording):
+    track, _ = read_poses(path)
+    if not isinstance(track, PoseTrack):
+        if len(track) != len(recording):
+            raise RecordingError(f"{path}: has {len(track)} poses for {len(recording)} scans")
+        return PoseTrack.of_poses([scan.stamp_ns for scan in recording], track)
+    if all(track.near(scan.stamp_ns) is None for scan in recording):
         raise RecordingError(f"{path}: no pose has the time of any scan of {recording.name}")
     return track
 
 
-@dataclass(frozen=True)
-class PosedRecording:
-    """A recording with the poses of another program as its ground truth, and no odometry."""
+class PosedRecording(DerivedRecording):
+    """A recording with the poses of another program as its ground truth.
 
-    recording: Recording
-    poses: PoseTrack
+    A scan that they do not cover has none.
+    """
 
-    has_odometry = False
-    n_projected = 0
+    def __init__(
+        self, recording: Recording, poses: PoseTrack, keeps_odometry: bool = False
+    ) -> None:
+        """keeps_odometry: whether the scans keep the odometry of the recording."""
+        super().__init__(recording)
+        self.poses, self._keeps_odometry = poses, keeps_odometry
 
     @property
-    def name(self) -> str:
-        """Name of the recording."""
-        return self.recording.name
-
-    def __len__(self) -> int:
-        return len(self.recording)
+    def has_odometry(self) -> bool:
+        """Whether it keeps odometry that the recording has."""
+        return self._keeps_odometry and self.recording.has_odometry
 
     def __iter__(self) -> Iterator[Scan]:
         for scan in self.recording:
-            T = self.poses.at(scan.stamp_ns)
-            yield replace(scan, T_world_sensor=T, T_odom_sensor=None)
+            T_odom = scan.T_odom_sensor if self._keeps_odometry else None
+            T = self.poses.near(scan.stamp_ns)
+            yield replace(scan, T_world_sensor=T, T_odom_sensor=T_odom)
 
-    def track(self) -> PoseTrack:
-        """Return the poses."""
-        return self.poses
+    def track(self) -> PoseTrack | None:
+        """Return the odometry that it keeps, else the poses."""
+        return self.recording.track() if self.has_odometry else self.poses

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from cello3d_ros.clouds import livox
 from cello3d_ros.errors import RecordingError
 
 POINTS, ODOMETRY, GROUND_TRUTH = "/points", "/odom", "/ground_truth"
 TF, TF_STATIC = "/tf", "/tf_static"
 CLOUD_TYPE, ODOMETRY_TYPE = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry"
+_SCAN_2D = "sensor_msgs/msg/LaserScan"
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 POSE_TYPES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
@@ -34,12 +36,16 @@ def choose(
     types: dict[str, str], points: str | None, odometry: str | None, ground_truth: str | None
 ) -> Topics:
     """Return the topics to read, of a bag's topics and their types and the names asked for."""
-    clouds = [t for t, kind in types.items() if kind == CLOUD_TYPE]
+    clouds = [t for t, kind in types.items() if kind in (CLOUD_TYPE, *livox.TYPES)]
     odometries = [t for t, kind in types.items() if kind == ODOMETRY_TYPE]
     poses = [t for t, kind in types.items() if kind in POSE_TYPES and t not in odometries]
     cloud = _pick(points, clouds, "", "PointCloud2")
     if cloud is None:
-        raise RecordingError(f"has no PointCloud2 topic; it has {', '.join(types) or 'none'}")
+        planar = [t for t, kind in types.items() if kind == _SCAN_2D]
+        what = f"; the scans on {planar[0]} are 2-D, a 3-D lidar is needed" if planar else ""
+        raise RecordingError(
+            f"has no PointCloud2 topic{what}; it has {', '.join(types) or 'none'}"
+        )
     named = ground_truth is not None or GROUND_TRUTH in odometries
     candidates = odometries + poses if named else poses
     truth = _pick(ground_truth, candidates, GROUND_TRUTH, "ground truth")

@@ -73,6 +73,21 @@ class Simulation:
         """True: it drifts from the exact poses."""
         return True
 
+    @property
+    def n_declared(self) -> int:
+        """How many scans there are."""
+        return self.n_scans
+
+    @property
+    def skipped(self) -> dict[str, int]:
+        """Nothing."""
+        return {}
+
+    @property
+    def times(self) -> str:
+        """Nothing: points have no times."""
+        return ""
+
     def __len__(self) -> int:
         return self.n_scans
 
@@ -187,6 +202,11 @@ def _at(track: PoseTrack, stamp_ns: int, after_s: Array) -> Array:
     """Return ``track.motion``, computed once for times that are alike."""
     times, which = np.unique(after_s, return_inverse=True)
     return track.motion(stamp_ns, times)[which]
+
+
+def n_poses(path: Path) -> int:
+    """Return how many poses a TUM file has.  Raises RecordingError."""
+    return len(read_tum(read_bytes(path), path).stamps_ns)
 
 
 def read_path(path: Path, n_scans: int) -> tuple[list[int], Array]:

@@ -15,8 +15,9 @@ import pytest
 from cello3d_ros.cli.convert import FORMATS
 from cello3d_ros.cli.main import main
 from cello3d_ros.geometry import se3
-from cello3d_ros.recordings import Scan, open_recording
+from cello3d_ros.recordings import ReadOptions, Scan, open_recording
 from cello3d_ros.recordings.bag_writer import write_bag
+from cello3d_ros.recordings.poses import kitti_line, tum_line
 
 START = 1_700_000_000_123_456_789
 LOSSLESS = [name for name in FORMATS if name != "kitti"]
@@ -147,7 +148,7 @@ def test_transforms_lead_from_the_map_to_the_lidar(tmp_path: Path) -> None:
     write_bag(tmp_path / "a", scans)
     frames = ("map", "lidar")
     for a, b in zip(
-        scans, open_recording(tmp_path / "a", ground_truth_frames=frames), strict=True
+        scans, open_recording(tmp_path / "a", ReadOptions(ground_truth_frames=frames)), strict=True
     ):
         assert np.abs(a.T_world_sensor - b.T_world_sensor).max() < 1e-13
 
@@ -231,3 +232,46 @@ def test_json_says_what_was_done(tmp_path: Path, capsys) -> None:
     assert found["n_scans"] == 3
     assert found["n_left_out"] == found["n_poses_projected"] == 0
     assert found["format"] == "mcap"
+
+
+@pytest.mark.parametrize("name", ["out.ply", "one.mcap", "one.db3", "one.bag", "a.npy"])
+def test_a_folder_named_like_a_file_is_refused(tmp_path: Path, capsys, name: str) -> None:
+    write_bag(tmp_path / "a", make_scans(2))
+    assert main(["convert", str(tmp_path / "a"), str(tmp_path / name)]) == 1
+    error = capsys.readouterr().err
+    assert f"{name}: a folder is made, name it without an ending: " in error
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_poses_of_a_file_are_the_ground_truth_of_any_recording(tmp_path: Path) -> None:
+    """Any SLAM's: TUM by stamp, KITTI by order; what the file does not cover has none."""
+    scans = make_scans(4)
+    bare = [Scan(stamp_ns=s.stamp_ns, points=s.points) for s in scans]
+    write_bag(tmp_path / "bare", bare)
+    (tmp_path / "p.tum").write_text(
+        "".join(tum_line(s.stamp_ns, s.T_world_sensor) for s in scans[:3])
+    )
+    (tmp_path / "p.kitti").write_text("".join(kitti_line(s.T_world_sensor) for s in scans))
+    for file, n_known in (("p.tum", 3), ("p.kitti", 4)):
+        out = tmp_path / f"with {file}"
+        words = ["convert", str(tmp_path / "bare"), str(out), "--format", "npy"]
+        assert main([*words, "--poses", str(tmp_path / file)]) == 0
+        found = [scan.T_world_sensor for scan in open_recording(out)]
+        assert [T is not None for T in found] == [k < n_known for k in range(4)]
+        for T, scan in zip(found[:n_known], scans, strict=False):
+            assert np.abs(T - scan.T_world_sensor).max() < 1e-12
+
+
+def test_poses_that_fit_no_cloud_are_an_error(tmp_path: Path, capsys) -> None:
+    scans = make_scans(3)
+    write_bag(tmp_path / "a", scans)
+    (tmp_path / "p.tum").write_text(tum_line(0, np.eye(4)) + tum_line(10**9, np.eye(4)))
+    (tmp_path / "p.kitti").write_text(kitti_line(np.eye(4)))
+    for file, words in (
+        ("p.tum", "no pose has the time of any"),
+        ("p.kitti", "has 1 poses for 3"),
+    ):
+        more = ["--poses", str(tmp_path / file)]
+        assert main(["convert", str(tmp_path / "a"), str(tmp_path / "b"), *more]) == 1
+        assert words in capsys.readouterr().err
+    assert not (tmp_path / "b").exists()

@@ -152,3 +152,24 @@ def test_a_damaged_recording_is_one_sentence(tmp_path: Path) -> None:
 def test_an_extrinsic_that_is_no_pose_is_refused(tmp_path: Path, extrinsic) -> None:
     with pytest.raises(RecordingError, match="needs x y z and a unit quaternion"):
         info.run(parsed(str(a_bag(tmp_path)), "--extrinsic", *extrinsic))
+
+
+def test_a_shipped_model_is_described_by_its_name(capsys, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    info.run(parsed("general"))
+    assert "general.npz" in capsys.readouterr().out
+
+
+def test_a_dataset_is_described(tmp_path: Path, capsys) -> None:
+    from cello3d_ros.cli.main import main
+
+    bag = str(a_bag(tmp_path))
+    assert main(["sample", bag, "--out", str(tmp_path / "d"), "--samples", "50"]) == 0
+    capsys.readouterr()
+    info.run(parsed(str(tmp_path / "d"), "--json"))
+    found = json.loads(capsys.readouterr().out)
+    assert found["kind"] == "dataset"
+    assert found["n_pairs"] == sum(found["outcomes"].values()) == 3
+    assert found["outcomes"] == {"too_few_points": 3}
+    assert found["recordings"] == {"walk": "3 pairs of 3 scans"}
+    assert found["sampling"]["n_samples"] == 50

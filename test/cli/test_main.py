@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -154,3 +156,17 @@ def test_an_interrupt_within_a_compiled_function_is_an_interrupt(monkeypatch, ca
     monkeypatch.setattr(info, "run", lambda _: (_ for _ in ()).throw(SystemError("another")))
     with pytest.raises(SystemError, match="another"):
         main(["info", "general"])
+
+
+def test_a_full_disk_under_the_output_is_one_sentence(tmp_path) -> None:
+    code = "from cello3d_ros.cli.main import main\nraise SystemExit(main())"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", code, "info", "general"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 1
+    assert done.stderr == "cello3d: cannot write the output: No space left on device\n"

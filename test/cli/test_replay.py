@@ -13,13 +13,15 @@ from rosbags.highlevel import AnyReader
 from cello3d_ros.cli.main import main
 from cello3d_ros.covariance.model import constant_model, save_model
 from cello3d_ros.geometry.gaussian import to_fixed_axes
-from cello3d_ros.geometry.se3 import exp, inverse, transform
+from cello3d_ros.geometry.se3 import exp, inverse, pose, transform
 from cello3d_ros.recordings import Scan
 from cello3d_ros.recordings.bag_writer import write_bag
 from cello3d_ros.recordings.poses import read_tum
 from cello3d_ros.tracking.warmup import room
 
 N = 6
+MOUNT = pose([0.5, 0.1, 0.8], [0.0, 0.0, np.sin(0.15), np.cos(0.15)])
+MOUNT_WORDS = ["0.5", "0.1", "0.8", "0", "0", str(np.sin(0.15)), str(np.cos(0.15))]
 TOPICS = ("/covariance_node/relative_pose", "/covariance_node/pose")
 
 
@@ -220,3 +222,47 @@ def test_it_runs_where_ros_cannot_be_imported(tmp_path: Path, model: Path) -> No
         [sys.executable, "-c", code, *words], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def mounted(path: Path, given: bool) -> Path:
+    """Write a walk whose odometry is of base_link, the lidar half a metre ahead, and say it so."""
+    from rosbags.typesys import Stores, get_typestore
+
+    from cello3d_ros.recordings.bag_messages import Messages
+    from cello3d_ros.recordings.bag_writer import write_messages
+
+    make = Messages(get_typestore(Stores.ROS2_JAZZY))
+    rng = np.random.default_rng(2)
+    messages = []
+    for i in range(N):
+        T, stamp_ns = exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.1]) * i), 10**18 + i * 5 * 10**8
+        odometry = make.odometry(T, stamp_ns, "odom")
+        odometry.child_frame_id = "base_link"
+        points = transform(inverse(T @ MOUNT), room(rng))
+        messages.append(("/odom", stamp_ns, odometry))
+        if given:
+            tf = make.transform(MOUNT, stamp_ns, "base_link", "lidar")
+            messages.append(("/tf", stamp_ns, tf))
+        messages.append(("/points", stamp_ns, make.cloud(Scan(stamp_ns=stamp_ns, points=points))))
+    write_messages(path, messages)
+    return path
+
+
+def test_the_sensor_is_where_the_transforms_of_the_bag_say_or_the_user(tmp_path, model) -> None:
+    words = ["--model", str(model)]
+    told, silent = mounted(tmp_path / "told", True), mounted(tmp_path / "silent", False)
+    assert main(["replay", str(told), "--out", str(tmp_path / "a"), *words]) == 0
+    given = ["--extrinsic", *MOUNT_WORDS]
+    assert main(["replay", str(silent), "--out", str(tmp_path / "b"), *words, *given]) == 0
+    for a, b in zip(lines_of(tmp_path / "a")[1:], lines_of(tmp_path / "b")[1:], strict=True):
+        assert np.abs(np.array(a["T_odom_read"]) - b["T_odom_read"]).max() < 1e-9
+    T = exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.1])) @ MOUNT
+    first = np.reshape(lines_of(tmp_path / "a")[1]["T_odom_read"], (4, 4))
+    assert np.abs(first - T).max() < 0.02
+
+
+def test_an_unknown_place_of_the_sensor_is_an_error(tmp_path, model, capsys) -> None:
+    bag = mounted(tmp_path / "silent", False)
+    assert main(["replay", str(bag), "--out", str(tmp_path / "r"), "--model", str(model)]) == 1
+    assert "--extrinsic" in capsys.readouterr().err
+    assert not (tmp_path / "r").exists()

@@ -185,3 +185,16 @@ def test_sequences_are_trained_and_tested_apart() -> None:
             )
     ratios = [round(s.kl_ours / s.kl_baseline, 2) for s in SEQUENCES.values()]
     assert ratios == [0.78, 0.79, 0.8, 0.95, 0.93, 0.87, 0.83]  # as the paper's Table I has them
+
+
+def test_the_page_is_in_the_folder_of_the_results_also_in_a_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """docs/results.md is written when --results asks for it."""
+    (tmp_path / "package.xml").write_text("<package><name>cello3d_ros</name></package>")
+    (tmp_path / "docs").mkdir()
+    monkeypatch.chdir(tmp_path)
+    words = ["--out", "out", "--samples", "100", "--jobs", "2"]
+    assert main(["reproduce", "fig-cylinder", *words]) == 0
+    assert (tmp_path / "out" / "results.md").is_file()
+    assert not any((tmp_path / "docs").iterdir())

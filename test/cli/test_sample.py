@@ -15,6 +15,9 @@ from threadpoolctl import threadpool_info
 
 from cello3d_ros.cli.main import main
 from cello3d_ros.geometry.se3 import exp, inverse, transform
+from cello3d_ros.learning.dataset import open_dataset
+from cello3d_ros.recordings import Scan
+from cello3d_ros.recordings.bag_writer import write_bag
 
 CONFIG = """
 cloud: {voxel_m: 0.1}
@@ -365,3 +368,30 @@ def test_python_samples_trains_and_evaluates_as_the_verbs_do(tmp_path, recording
         main(["evaluate", str(tmp_path / "again"), "--model", str(model), "--only", "three"]) == 0
     )
     assert f"covariances are {found.methods['cello3d'].verdict} " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("n_scans", "words"), [(3, "no ground truth"), (1, "1 scans, a pair")])
+def test_a_recording_that_gives_no_pair_begins_no_dataset(tmp_path, capsys, n_scans, words):
+    scans = [Scan(stamp_ns=k + 1, points=np.ones((9, 3))) for k in range(n_scans)]
+    write_bag(tmp_path / "bare", scans)
+    assert main(["sample", str(tmp_path / "bare"), "--out", str(tmp_path / "d")]) == 1
+    assert f"bare has {words}" in capsys.readouterr().err
+    assert not (tmp_path / "d").exists()
+
+
+def test_pairs_in_a_gap_of_ground_truth_are_rejected_by_name(tmp_path):
+    poses = [None if k == 2 else exp([0.1 * k, 0, 0, 0, 0, 0]) for k in range(4)]
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    write_bag(
+        tmp_path / "gap",
+        [
+            Scan(stamp_ns=10**18 + k * 3 * 10**9, points=points, T_world_sensor=T)
+            for k, T in enumerate(poses)
+        ],
+    )
+    words = ["--samples", "50", "--max-gap", "1"]
+    assert main(["sample", str(tmp_path / "gap"), "--out", str(tmp_path / "d"), *words]) == 0
+    dataset = open_dataset(tmp_path / "d")
+    reasons = {key[1:]: dataset.read(*key).reason for key in dataset.pair_keys()}
+    assert reasons[0, 1] == "too_few_points"
+    assert reasons[1, 2] == "no_ground_truth"

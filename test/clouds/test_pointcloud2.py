@@ -116,7 +116,6 @@ def test_trailing_bytes_are_ignored(points):
         (lambda m: setattr(m.fields[0], "offset", 9), "beyond point_step 12"),
         (lambda m: setattr(m, "point_step", 0), "beyond point_step 0"),
         (lambda m: setattr(m, "point_step", 2**32 - 1), "point_step 4294967295 is absurd"),
-        (lambda m: setattr(m, "row_step", 12), "row_step 12 is less than width"),
     ],
 )
 def test_a_message_that_contradicts_itself_is_refused(points, change, words):
@@ -124,3 +123,24 @@ def test_a_message_that_contradicts_itself_is_refused(points, change, words):
     change(cloud)
     with pytest.raises(CloudError, match=words):
         read_points(cloud)
+
+
+@pytest.mark.parametrize("row_step", [0, 12, 7777])
+@pytest.mark.parametrize("height", [1, 6])
+def test_a_wrong_row_step_says_nothing_where_the_data_are_complete(points, row_step, height):
+    cloud = message(points, PLAIN, height=height)
+    cloud.row_step = row_step
+    np.testing.assert_array_equal(read_points(cloud), points[:, :3])
+
+
+def test_a_wrong_row_step_is_refused_where_it_alone_would_tell_the_rows(points):
+    cloud = message(points, PLAIN, height=6, padding=4)
+    cloud.row_step = 12
+    with pytest.raises(CloudError, match="row_step 12 is less than width"):
+        read_points(cloud)
+
+
+def test_a_cloud_of_one_row_does_not_lose_points_to_a_row_step_of_another(points):
+    cloud = message(points, PLAIN, extra=b"\0" * 24)
+    cloud.row_step = 24
+    assert len(read_points(cloud)) == 60

@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from cello3d_ros.errors import RecordingError, WriteError
 from cello3d_ros.geometry import se3
-from cello3d_ros.recordings import Scan, open_recording
+from cello3d_ros.recordings import ReadOptions, Scan, open_recording
 from cello3d_ros.recordings.bag import BagRecording
 from cello3d_ros.recordings.bag_writer import write_bag
 
@@ -75,7 +75,7 @@ def pose(kind: str, stamp_ns: int, T, msgtype: str = ODOMETRY, quaternion=None):
         transform = types["geometry_msgs/msg/Transform"](
             translation=types["geometry_msgs/msg/Vector3"](*xyz), rotation=rotation
         )
-        return types[TRANSFORM](header=head, child_frame_id="y", transform=transform)
+        return types[TRANSFORM](header=head, child_frame_id="x", transform=transform)
     place = types["geometry_msgs/msg/Pose"](
         position=types["geometry_msgs/msg/Point"](*xyz), orientation=rotation
     )
@@ -84,7 +84,7 @@ def pose(kind: str, stamp_ns: int, T, msgtype: str = ODOMETRY, quaternion=None):
     zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
     return types[ODOMETRY](
         header=head,
-        child_frame_id="y",
+        child_frame_id="x",
         pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=place, covariance=np.zeros(36)),
         twist=types["geometry_msgs/msg/TwistWithCovariance"](
             twist=types["geometry_msgs/msg/Twist"](linear=zero, angular=zero),
@@ -246,7 +246,7 @@ def messages_of(topics: dict[str, str]):
 
 def chosen(tmp_path: Path, topics: dict[str, str], **named: str) -> SimpleNamespace:
     path = write(tmp_path / "b", "mcap", messages_of(topics))
-    return SimpleNamespace(**BagRecording(path, **named).topics._asdict())
+    return SimpleNamespace(**BagRecording(path, ReadOptions(**named)).topics._asdict())
 
 
 def test_topics_are_found_by_type(tmp_path: Path) -> None:
@@ -269,7 +269,7 @@ def test_an_only_odometry_called_ground_truth_is_not_odometry(tmp_path: Path) ->
 def test_topics_can_be_named_and_left_out(tmp_path: Path) -> None:
     topics = chosen(
         tmp_path, {"/a": CLOUD, "/b": CLOUD, "/odom": ODOMETRY, "/x": ODOMETRY, "/y": POSE},
-        points_topic="/b", odometry_topic="/x", ground_truth_topic="",
+        points="/b", odometry="/x", ground_truth="",
     )  # fmt: skip
     assert (topics.points, topics.odometry, topics.ground_truth) == ("/b", "/x", None)
 
@@ -279,18 +279,18 @@ def test_topics_can_be_named_and_left_out(tmp_path: Path) -> None:
     [
         ({"/a": CLOUD, "/b": CLOUD}, {}, "several PointCloud2 topics, name one of /a, /b"),
         ({"/x": ODOMETRY}, {}, "no PointCloud2 topic; it has /x"),
-        ({"/a": CLOUD}, {"points_topic": "/b"}, "no PointCloud2 topic '/b'; candidates are /a"),
-        ({"/a": CLOUD}, {"points_topic": ""}, "no PointCloud2 topic"),
+        ({"/a": CLOUD}, {"points": "/b"}, "no PointCloud2 topic '/b'; candidates are /a"),
+        ({"/a": CLOUD}, {"points": ""}, "no PointCloud2 topic"),
         ({"/a": CLOUD, "/x": ODOMETRY, "/y": ODOMETRY}, {}, "several Odometry topics.*/x, /y"),
         ({"/a": CLOUD, "/x": POSE, "/y": TRANSFORM}, {}, "several ground truth topics.*/x, /y"),
-        ({"/a": CLOUD, "/x": POSE}, {"odometry_topic": "/x"}, "no Odometry topic '/x'"),
-        ({"/a": CLOUD}, {"ground_truth_topic": "/a"}, "no ground truth topic '/a'"),
+        ({"/a": CLOUD, "/x": POSE}, {"odometry": "/x"}, "no Odometry topic '/x'"),
+        ({"/a": CLOUD}, {"ground_truth": "/a"}, "no ground truth topic '/a'"),
     ],
 )
 def test_a_choice_that_is_not_clear_lists_candidates(tmp_path, topics, named, message) -> None:
     path = write(tmp_path / "b", "mcap", messages_of(topics))
     with pytest.raises(RecordingError, match=message) as caught:
-        open_recording(path, **named)
+        open_recording(path, ReadOptions(**named))
     assert str(path) in str(caught.value)
 
 
@@ -298,24 +298,28 @@ def test_a_choice_that_is_not_clear_lists_candidates(tmp_path, topics, named, me
 def test_a_bad_odometry_message_is_an_error_with_topic_and_path(tmp_path, quaternion) -> None:
     bad = pose("mcap", 5, np.eye(4), quaternion=quaternion)
     path = write(tmp_path / "b", "mcap", [("/odom", 1, bad), *messages_of({"/a": CLOUD})])
-    with pytest.raises(RecordingError, match=r"/odom: the (pose|quaternion) is "):
+    with pytest.raises(RecordingError, match=r"b: /odom: the (pose|quaternion) is "):
+        list(open_recording(path, ReadOptions(strict=True)))
+    sentence = r"/odom: none of its 1 poses can be used: /odom: the (pose|quaternion) is "
+    with pytest.raises(RecordingError, match=sentence):
         list(open_recording(path))
 
 
-def test_a_malformed_cloud_is_an_error_with_its_number(tmp_path: Path) -> None:
+def test_a_malformed_cloud_is_an_error_with_its_number_when_strict(tmp_path: Path) -> None:
     good = cloud("mcap", 1, np.ones((3, 3)))
     short = cloud("mcap", 2, np.ones((3, 3)), width=9, row_step=108)
     path = write(tmp_path / "b", "mcap", [("/p", 1, good), ("/p", 2, short)])
-    scans = iter(open_recording(path))
+    scans = iter(open_recording(path, ReadOptions(strict=True)))
     assert len(next(scans).points) == 3
     with pytest.raises(RecordingError, match=r"b: cloud 1 of /p: "):
         next(scans)
 
 
-def test_clouds_out_of_order_are_an_error(tmp_path: Path) -> None:
+def test_clouds_out_of_order_are_an_error_when_strict(tmp_path: Path) -> None:
     clouds = [("/p", t, cloud("mcap", s, np.ones((3, 3)))) for t, s in ((1, 9), (2, 8))]
-    with pytest.raises(RecordingError, match="cloud 1 of /p: its stamp 8 does not follow 9"):
-        list(open_recording(write(tmp_path / "b", "mcap", clouds)))
+    path = write(tmp_path / "b", "mcap", clouds)
+    with pytest.raises(RecordingError, match="b: the stamp 8 of a cloud on /p does not follow 9"):
+        list(open_recording(path, ReadOptions(strict=True)))
 
 
 def data_file(path: Path) -> Path:

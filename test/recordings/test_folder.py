@@ -7,7 +7,7 @@ import pytest
 
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
-from cello3d_ros.recordings import open_recording
+from cello3d_ros.recordings import ReadOptions, open_recording
 from cello3d_ros.recordings.files import read_columns
 from cello3d_ros.recordings.poses import kitti_line, seconds_text, seconds_to_ns, tum_line
 
@@ -52,7 +52,7 @@ def test_names_that_are_times_are_matched_by_stamp(tmp_path: Path, text) -> None
     folder = clouds(tmp_path / "a", [text(s) for s in STAMPS])
     shuffled = np.random.default_rng(1).permutation(N)
     (folder / "traj.tum").write_text(tum([STAMPS[i] for i in shuffled], T[shuffled]))
-    check(open_recording(folder, poses=folder / "traj.tum"))
+    check(open_recording(folder, ReadOptions(poses=folder / "traj.tum")))
 
 
 def test_poses_between_stamps_are_interpolated_and_outside_unknown(tmp_path: Path) -> None:

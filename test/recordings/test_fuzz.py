@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
-from cello3d_ros.recordings import Scan, open_recording
+from cello3d_ros.recordings import ReadOptions, Scan, open_recording
 from cello3d_ros.recordings.bag_messages import Messages
 from cello3d_ros.recordings.bag_writer import write_bag
 from cello3d_ros.recordings.files import read_columns
@@ -185,7 +185,7 @@ def contents(path: Path) -> list[tuple]:
                 for v in (s.T_world_sensor, s.T_odom_sensor, s.intensity, s.time_s)
             ),
         )
-        for s in open_recording(path)
+        for s in open_recording(path, ReadOptions(strict=True))
     ]
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
-from cello3d_ros.recordings import open_recording
+from cello3d_ros.recordings import ReadOptions, open_recording
 from cello3d_ros.recordings.kitti import KittiRecording
 
 TR = se3.exp([0.1, -0.2, 0.3, 1.2, -1.1, 1.3])  # lidar -> camera, far from the identity
@@ -146,11 +146,43 @@ def test_a_broken_file_is_one_sentence(tmp_path: Path, file, content, message) -
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "rectified"),
+    [("Tr_velo_to_cam: {Tr}", False), ("R0_rect: {R}\nTr_velo_to_cam: {Tr}", True),
+     ("R_rect {R}\nTr_velo_cam {Tr}", True)],
+)  # fmt: skip
+def test_other_names_of_the_calibration_are_read(tmp_path, text: str, rectified: bool) -> None:
+    Tr, R = se3.exp([0.1, 0.2, -0.3, 0.5, -0.4, 1.2]), se3.exp([0, 0, 0, 0.01, 0.02, -0.01])
+    path = folder(tmp_path, Tr=R @ Tr if rectified else Tr)
+    expected = [scan.T_world_sensor for scan in open_recording(path)]
+
+    def numbers(rows) -> str:
+        return " ".join(repr(float(v)) for v in np.ravel(rows))
+
+    told = text.format(Tr=numbers(Tr[:3]), R=numbers(R[:3, :3]))
+    (path / "calib.txt").write_text(f"P0: {numbers(np.eye(4)[:3])}\n{told}\n")
+    for scan, T in zip(open_recording(path), expected, strict=True):
+        assert np.allclose(scan.T_world_sensor, T, atol=1e-9)
+
+
+def test_poses_of_the_camera_without_the_lidars_place_are_refused(tmp_path: Path) -> None:
+    path = folder(tmp_path)
+    (path / "calib.txt").write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(RecordingError, match=r"calib\.txt: has no Tr, so the poses of the camera"):
+        open_recording(path)
+    (path / "poses.txt").unlink()
+    assert all(scan.T_world_sensor is None for scan in open_recording(path))
+
+
 def test_a_cut_scan_is_named_when_it_is_reached(tmp_path: Path) -> None:
     path = folder(tmp_path)
     cut = path / "velodyne" / "000001.bin"
     cut.write_bytes(cut.read_bytes()[:-3])
-    scans = iter(open_recording(path))
+    recording = open_recording(path)
+    found = [scan.stamp_ns for scan in recording]
+    assert len(found) == len(recording) == recording.n_declared - 1
+    assert recording.skipped == {"malformed": 1}
+    scans = iter(open_recording(path, ReadOptions(strict=True)))
     next(scans)
     with pytest.raises(RecordingError, match=r"000001\.bin: 813 bytes are no whole number"):
         next(scans)
@@ -167,7 +199,7 @@ def test_scans_that_are_missing_or_not_numbered_are_refused(tmp_path: Path) -> N
 
 def test_topics_of_a_folder_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="has no topics"):
-        open_recording(folder(tmp_path), points_topic="/points")
+        open_recording(folder(tmp_path), ReadOptions(points="/points"))
 
 
 @pytest.mark.parametrize("name", ["street", "hall", "tree_road", "rooms_narrow_fov"])

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
-from cello3d_ros.recordings import Scan, open_recording
+from cello3d_ros.recordings import ReadOptions, Scan, open_recording
 from cello3d_ros.recordings.bag_messages import Messages
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -92,7 +92,7 @@ def test_static_transforms_may_be_chained_and_inverted(tmp_path: Path) -> None:
 def test_an_extrinsic_that_is_given_counts_more(tmp_path: Path) -> None:
     path = write(tmp_path / "b", [*mount(), *odometry(), *clouds()])
     given = se3.exp([1, 2, 3, 0.1, 0.2, 0.3])
-    for k, scan in enumerate(open_recording(path, T_base_sensor=given)):
+    for k, scan in enumerate(open_recording(path, ReadOptions(T_base_sensor=given))):
         assert np.allclose(scan.T_odom_sensor, ODOM[k] @ given, atol=1e-12)
 
 
@@ -102,16 +102,30 @@ def test_poses_of_the_lidar_itself_stay(tmp_path: Path) -> None:
         assert np.allclose(scan.T_odom_sensor, ODOM[k], atol=1e-12)
 
 
-def test_where_nothing_connects_frames_poses_are_the_sensors(tmp_path: Path) -> None:
-    path = write(tmp_path / "b", [*odometry("somewhere"), *mount(), *clouds()])
-    for k, scan in enumerate(open_recording(path)):
-        assert np.allclose(scan.T_odom_sensor, ODOM[k], atol=1e-12)
+@pytest.mark.parametrize("frame", ["somewhere", "base_link"])
+def test_where_nothing_connects_frames_the_error_names_the_option(tmp_path, frame) -> None:
+    transforms = mount() if frame == "somewhere" else []
+    path = write(tmp_path / "b", [*odometry(frame), *transforms, *clouds()])
+    sentence = rf"b: the poses on /odom are of '{frame}', the clouds of 'lidar', .* --extrinsic X"
+    with pytest.raises(RecordingError, match=sentence):
+        list(open_recording(path))
+    for k, scan in enumerate(open_recording(path, ReadOptions(T_base_sensor=MOUNT))):
+        assert np.allclose(scan.T_odom_sensor, ODOM[k] @ MOUNT, atol=1e-12)
+
+
+def test_a_mount_that_turns_is_no_extrinsic(tmp_path: Path) -> None:
+    turning = [se3.exp([0, 0, 0, 0, 0, 0.1 * k]) for k in range(N)]
+    path = write(tmp_path / "b", [*odometry(), *tf("base_link", "lidar", turning), *clouds()])
+    with pytest.raises(RecordingError, match="--extrinsic"):
+        list(open_recording(path))
 
 
 def test_ground_truth_from_tf_between_two_frames(tmp_path: Path) -> None:
     path = write(tmp_path / "b", [*mount(), *tf(), *clouds()])
     for frame in ("lidar", "base_link"):
-        for k, scan in enumerate(open_recording(path, ground_truth_frames=("map", frame))):
+        for k, scan in enumerate(
+            open_recording(path, ReadOptions(ground_truth_frames=("map", frame)))
+        ):
             assert np.allclose(scan.T_world_sensor, TRUTH[k] @ MOUNT, atol=1e-12)
 
 
@@ -119,7 +133,7 @@ def test_tf_is_composed_over_time_and_interpolated(tmp_path: Path) -> None:
     messages = [*mount(), *tf("map", "odom"), *tf("odom", "base_link", ODOM)]
     late = Scan(stamp_ns=stamp(1) + STEP // 4, points=POINTS)
     path = write(tmp_path / "b", [*messages, ("/points", late.stamp_ns, MAKE.cloud(late))])
-    (scan,) = open_recording(path, ground_truth_frames=("/map", "lidar"))
+    (scan,) = open_recording(path, ReadOptions(ground_truth_frames=("/map", "lidar")))
     parts = [se3.interpolate(T[1], T[2], 0.25) for T in (TRUTH, ODOM)]
     assert np.allclose(scan.T_world_sensor, parts[0] @ parts[1] @ MOUNT, atol=1e-12)
 
@@ -129,23 +143,28 @@ def test_tf_is_walked_upward_too(tmp_path: Path) -> None:
     path = write(
         tmp_path / "b", [*mount(), *tf("base_link", "world", se3.inverse(TRUTH)), *clouds()]
     )
-    for k, scan in enumerate(open_recording(path, ground_truth_frames=("world", "lidar"))):
+    for k, scan in enumerate(
+        open_recording(path, ReadOptions(ground_truth_frames=("world", "lidar")))
+    ):
         assert np.allclose(scan.T_world_sensor, TRUTH[k] @ MOUNT, atol=1e-12)
 
 
 def test_outside_the_span_of_tf_there_is_no_ground_truth(tmp_path: Path) -> None:
     path = write(tmp_path / "b", [*mount(), *list(tf())[:3], *clouds()])
-    found = [s.T_world_sensor for s in open_recording(path, ground_truth_frames=("map", "lidar"))]
+    found = [
+        s.T_world_sensor
+        for s in open_recording(path, ReadOptions(ground_truth_frames=("map", "lidar")))
+    ]
     assert [T is not None for T in found] == [True, True, True, False, False]
 
 
 def test_frames_that_nothing_connects_are_an_error_that_lists_frames(tmp_path: Path) -> None:
     path = write(tmp_path / "b", [*mount(), *tf(), *clouds()])
     with pytest.raises(RecordingError, match="connect 'mars' and 'lidar'; frames are base_link"):
-        list(open_recording(path, ground_truth_frames=("mars", "lidar")))
+        list(open_recording(path, ReadOptions(ground_truth_frames=("mars", "lidar"))))
     bare = write(tmp_path / "c", clouds())
     with pytest.raises(RecordingError, match="no TFMessage topic"):
-        open_recording(bare, ground_truth_frames=("map", "lidar"))
+        open_recording(bare, ReadOptions(ground_truth_frames=("map", "lidar")))
 
 
 def test_the_track_is_that_of_the_sensor(tmp_path: Path) -> None:

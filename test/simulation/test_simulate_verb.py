@@ -105,3 +105,19 @@ def test_wrong_properties_are_one_sentence(setting: str, message: str, tmp_path:
     with pytest.raises((RecordingError, ConfigError), match=message) as caught:
         verb.run(parsed(*words))
     assert "\n" not in str(caught.value)
+
+
+def test_a_path_gives_as_many_scans_as_it_has_poses(tmp_path: Path) -> None:
+    pytest.importorskip("open3d")
+    rows = [f"{1.6e9 + 0.1 * k:.1f} {0.05 * k} 0 1 0 0 0 1\n" for k in range(31)]
+    (tmp_path / "path.tum").write_text("".join(rows))
+    words = ["corridor", "--scanner", "spinning16", "--path", str(tmp_path / "path.tum")]
+    verb.run(parsed(*words, "--out", str(tmp_path / "all")))
+    assert len(open_recording(tmp_path / "all")) == 31
+    verb.run(parsed(*words, "--scans", "2", "--out", str(tmp_path / "two")))
+    assert len(open_recording(tmp_path / "two")) == 2
+
+
+def test_a_bag_named_like_a_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"one\.mcap: a folder is made, name it without"):
+        verb.run(parsed("rooms", "--out", str(tmp_path / "one.mcap")))
