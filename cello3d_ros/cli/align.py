@@ -80,13 +80,13 @@ def joint(
 
     from cello3d_ros.config import pipeline_of
     from cello3d_ros.learning.align_report import sentences
-    from cello3d_ros.learning.aligned import aligned_parts
+    from cello3d_ros.learning.aligned import aligned_parts, joint_folder
     from cello3d_ros.recordings import open_recording
 
     found: list[Recording] = []
     for path in paths:
         recording = open_recording(path)
-        folder = dataset.with_name(f"{dataset.name}.joint") / recording.name
+        folder = joint_folder(dataset, recording.name)
         with bar(recording.name) as progress, threadpool_limits(1, user_api="blas"):
             parts = aligned_parts(recording, folder, pipeline_of(config), n_threads, progress)
         print("\n".join(sentences(parts[0].alignment)))

@@ -29,6 +29,7 @@ from cello3d_ros.evaluation.comparison import (
 from cello3d_ros.evaluation.online import answers, prepared
 from cello3d_ros.evaluation.result import Evaluation, Group, Pair, Poses, ShownPair, Trajectory
 from cello3d_ros.evaluation.trajectories import consistency, length_m, odometry_runs, shown
+from cello3d_ros.learning.aligned import aligned_parts, joint_folder
 from cello3d_ros.learning.dataset import Dataset, open_dataset
 from cello3d_ros.learning.examples import Examples, load_examples
 from cello3d_ros.learning.identity import prints_of
@@ -102,7 +103,7 @@ def evaluate(
     loaded = load_model(path)
     names = chosen(opened, settings.only)
     seen = _seen(loaded, opened, names, settings.allow_seen)
-    recordings = _recordings(settings.recordings, names)
+    recordings = _recordings(settings.recordings, names, opened)
     baseline = [open_dataset(folder) for folder in settings.baseline]
     mean = mean_of(baseline) if baseline else training_mean(loaded)
     examples = load_examples(opened, names)
@@ -157,8 +158,13 @@ def _seen(
     return set(seen)
 
 
-def _recordings(paths: Iterable[Path | str], names: Sequence[str]) -> list[Recording]:
-    """Open recordings.  Raises RecordingError for one that is not evaluated."""
+def _recordings(
+    paths: Iterable[Path | str], names: Sequence[str], datasets: Sequence[Dataset]
+) -> list[Recording]:
+    """Open recordings, with the poses that they were sampled about.
+
+    Raises RecordingError for one that is not evaluated.
+    """
     found: dict[str, Recording] = {}
     for path in paths:
         recording = open_recording(path)
@@ -168,6 +174,11 @@ def _recordings(paths: Iterable[Path | str], names: Sequence[str]) -> list[Recor
                 f"{', '.join(names)}"
             )
         found[recording.name] = recording
+        for dataset in datasets:
+            if dataset.recordings.get(recording.name, {}).get("poses") == "joint":
+                folder = joint_folder(dataset.path, recording.name)
+                parts = aligned_parts(recording, folder, dataset.pipeline)
+                found |= {part.name: part for part in parts if part.name in names}
     return list(found.values())
 
 

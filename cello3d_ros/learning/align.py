@@ -242,16 +242,22 @@ def _nothing(name: str, n: int, reasons: dict[int, str]) -> str:
 
 
 def _keyframes(chain: Chain) -> NDArray[np.bool_]:
-    """Return which scans others are registered to: the first of a part, then after each motion."""
+    """Return which scans others are registered to: the first of a part, then after each motion.
+
+    A part that hardly moves has 17 of them, evenly spaced, or all of its scans.
+    """
     is_key = np.zeros(len(chain.part), np.bool_)
-    last: dict[int, Array] = {}
-    for k in np.flatnonzero(chain.part >= 0):
-        part, T = int(chain.part[k]), chain.poses[k]
-        if part in last:
-            xi = log(inverse(last[part]) @ T)
-            if np.linalg.norm(xi[:3]) < _KEYFRAME_M and np.linalg.norm(xi[3:]) < _KEYFRAME_RAD:
-                continue
-        is_key[k], last[part] = True, T
+    for p in range(int(chain.part.max()) + 1):
+        members = np.flatnonzero(chain.part == p)
+        longest = -(-len(members) // (2 * N_BEFORE + 1))
+        last = -longest
+        for at, k in enumerate(members):
+            if at > 0:
+                xi = log(inverse(chain.poses[members[last]]) @ chain.poses[k])
+                moved = np.linalg.norm(xi[:3]) >= _KEYFRAME_M
+                moved |= np.linalg.norm(xi[3:]) >= _KEYFRAME_RAD
+            if at == 0 or moved or at - last >= longest:
+                is_key[k], last = True, at
     return is_key
 
 
@@ -317,7 +323,9 @@ def _visit(
     """
     chain, sweep = state.chain, state.sweep
     is_first = sweep == 1
-    members = np.flatnonzero((chain.part == chain.part[k]) & state.held)
+    is_member = (chain.part == chain.part[k]) & state.held
+    is_member[k] = True
+    members = np.flatnonzero(is_member)
     keyframes = members[state.keyframes[members]]
     if is_first:
         keyframes = keyframes[keyframes < k]

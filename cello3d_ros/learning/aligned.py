@@ -86,6 +86,11 @@ def aligned_parts(
     return [AlignedPart(recording, found, part) for part in range(found.n_parts)]
 
 
+def joint_folder(dataset: Path, name: str) -> Path:
+    """Return where the joint poses of a recording are kept: beside the dataset of its samples."""
+    return dataset.with_name(f"{dataset.name}.joint") / name
+
+
 def pose_facts(part: AlignedPart) -> dict[str, Any]:
     """Return what a dataset should know of the poses."""
     sigma_m, sigma_rad = part.alignment.sigmas()

@@ -90,6 +90,17 @@ def test_a_tuned_model_is_not_judged_by_its_own_recording(
     assert "was trained or validated on mine" in capsys.readouterr().err
 
 
+def test_clouds_are_judged_about_the_poses_that_they_were_sampled_about(
+    recording: Path, tuned: tuple[Path, Path, list[str]], tmp_path: Path
+) -> None:
+    timid, out, _ = tuned
+    report = tmp_path / "report.json"
+    command = ["evaluate", f"{out}.dataset", "--model", str(timid), "--json", str(report)]
+    flags = ["--recordings", str(recording), "--online-pairs", "2", "--trajectories", "2"]
+    assert main([*command, *flags]) == 0
+    assert list(json.loads(report.read_text())["trajectories"]) == ["mine"]
+
+
 def test_sample_takes_joint_poses(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "dataset"
     command = ["sample", str(recording), "--out", str(out), "--samples", "50", "--max-gap", "1"]

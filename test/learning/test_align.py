@@ -251,3 +251,10 @@ def test_common_normals_see_the_surface_where_one_scan_sees_a_ring() -> None:
     assert np.abs(normals[:, 2]).min() > 0.99
     alone = common_normals(tree, build_tree(own + 100.0), np.eye(4), 10)
     assert np.abs(alone[:, 2]).min() < 0.5
+
+
+def test_a_sensor_that_stands_still_is_found_to_stand_still() -> None:
+    truth = np.tile(np.eye(4), (4, 1, 1))
+    found = align(Clouds(scans_of(1, truth)), PIPELINE)
+    assert found.members().tolist() == [0, 1, 2, 3]
+    assert np.abs(step_errors(found, truth)[:, :3]).max() < 0.002
