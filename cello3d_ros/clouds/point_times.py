@@ -147,14 +147,13 @@ def recognise(
     def after_stamp_ns(ns: int) -> float:
         return _exact_ns(base, ns, stamp_ns) + ns * float(middle)
 
-    span, longest_s = float(high - low), _longest_s(period_s)
+    span = float(high - low)
+    near = [n for n in UNITS.values() if abs(after_stamp_ns(n)) < _NEAR_NS]
+    candidates = near if stamp_ns > _EARLIEST_NS else []
+    candidates = candidates or _units(span, values.dtype.kind == "f", period_s)
     if unit is not None:
         candidates = [UNITS[unit]]
-    else:
-        near = stamp_ns > _EARLIEST_NS
-        candidates = [n for n in UNITS.values() if near and abs(after_stamp_ns(n)) < _NEAR_NS]
-        candidates = candidates or _units(span, values.dtype.kind == "f", period_s)
-    if not candidates or 1e-9 * candidates[0] * span > longest_s:
+    if not candidates or 1e-9 * candidates[0] * span > _longest_s(period_s):
         raise PointTimesError(
             f"the times of the points span {span:g}, no scan in any unit"
             + ("" if period_s is None else f" when clouds are {period_s:.3g} s apart")
