@@ -21,6 +21,7 @@ SMALL_GICP = ["small_gicp>=1.0"]
 REPORT = ["plotly>=6"]  # maintained; its 3-D views work in one file without a network
 TOOLS = ["ruff", "mypy", "import-linter", "types-PyYAML", "playwright"]
 FUSION = ["gtsam>=4.3"]  # pose graphs; its wheels take the numpy of today
+INTEGRATION = ["g2opy>=2.3", "evo>=1.31", "pandas>=2.2"]  # what docs/integration.md shows
 DOCS = ["pdoc>=15"]  # reads docstrings as they are, needs no configuration and no theme
 BENCH = ["kiss-icp>=1.2"]  # what benchmarks/online.py compares with
 TEST = [
@@ -76,6 +77,7 @@ setup(
         "dev": [
             *TEST,
             *FUSION,
+            *INTEGRATION,
             *DOCS,
             "ruff",
             "mypy",

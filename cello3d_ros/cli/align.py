@@ -94,17 +94,20 @@ def joint(
     return found
 
 
-def posed(recording: Recording, poses: Path | None, n_threads: int) -> Recording:
+def posed(
+    recording: Recording, poses: Path | None, n_threads: int, keeps_odometry: bool = False
+) -> Recording:
     """Return a recording with poses: its own, those of a file, or for the word joint its clouds'.
 
-    Of a recording that falls into parts the longest is returned.
+    Of a recording that falls into parts the longest is returned.  keeps_odometry: beside the poses
+    of a file.
     """
     if poses is None:
         return recording
     if str(poses) != "joint":
         from cello3d_ros.recordings.start_poses import PosedRecording, start_track
 
-        return PosedRecording(recording, start_track(poses, recording))
+        return PosedRecording(recording, start_track(poses, recording), keeps_odometry)
     from threadpoolctl import threadpool_limits
 
     from cello3d_ros.learning.align import align

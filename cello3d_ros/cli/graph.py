@@ -4,18 +4,27 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from cello3d_ros.cli.sources import add_source_arguments, open_source
+from cello3d_ros.cli.sources import add_source_arguments, open_source, with_progress
 from cello3d_ros.errors import RecordingError
+
+if TYPE_CHECKING:
+    from cello3d_ros.evaluation.graph import Graph, GraphSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
     parser.add_argument("recording", metavar="RECORDING", type=Path, help="bag or data set")
     parser.add_argument(
-        "--out", metavar="GRAPH", type=Path, required=True, help=".g2o, .json (GTSAM) or .csv"
+        "--out",
+        metavar="GRAPH",
+        type=Path,
+        required=True,
+        action="append",
+        help="file to write, by its ending: .g2o, .json (GTSAM), .csv, or of the poses alone .tum "
+        "or .txt (KITTI); may be given several times",
     )
     parser.add_argument(
         "--model", metavar="M", default="", help="model file or name of a shipped one (general)"
@@ -23,6 +32,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_source_arguments(parser)
     parser.add_argument(
         "--max-gap", type=int, default=1, metavar="G", help="scans before a scan to register to"
+    )
+    parser.add_argument(
+        "--loops",
+        type=Path,
+        metavar="FILE",
+        help="loop closures to register: rows of i j, or of i j x y z qx qy qz qw",
+    )
+    parser.add_argument(
+        "--odometry-drift",
+        nargs=3,
+        type=float,
+        metavar=("SHARE", "DEG_PER_M", "TURN_SHARE"),
+        help="make edges of the odometry, which errs by a share of each step's length, by degrees "
+        "a metre and by a share of each turn (1 sigma)",
     )
     parser.add_argument(
         "--registration",
@@ -38,41 +61,69 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Register, write the graph and say what it holds."""
-    from tqdm import tqdm
-
     from cello3d_ros.cli.align import posed
     from cello3d_ros.covariance.case import DEFAULTS
     from cello3d_ros.covariance.estimator import Estimator
-    from cello3d_ros.evaluation.graph import WRITERS, build_graph, write_graph
+    from cello3d_ros.evaluation.graph import build_graph
+    from cello3d_ros.evaluation.graph_files import check_graph_file, write_graph
 
-    out = arguments.out
-    if out.suffix not in WRITERS:
-        raise RecordingError(f"{out}: a graph is written as {', '.join(WRITERS)}")
-    if out.is_dir() or not out.absolute().parent.is_dir():
-        raise RecordingError(f"cannot write {out}: not a file in an existing folder")
-    if arguments.max_gap < 1:
-        raise RecordingError(f"--max-gap must be at least 1: {arguments.max_gap}")
+    for out in arguments.out:
+        check_graph_file(out)
+    settings = _settings(arguments)
     poses, arguments.poses = arguments.poses, None
-    recording = posed(open_source(arguments.recording, arguments), poses, arguments.jobs)
+    source = open_source(arguments.recording, arguments)
+    recording = posed(source, poses, arguments.jobs, keeps_odometry=settings.drift is not None)
     estimator = Estimator(
         arguments.model or "general", settings=DEFAULTS._replace(n_threads=arguments.jobs)
     )
-    with tqdm(
-        total=len(recording), unit="scan", disable=not sys.stderr.isatty(), leave=False
-    ) as bar:
-        graph = build_graph(
-            recording,
-            estimator,
-            arguments.max_gap,
-            arguments.registration == "icp",
-            arguments.seed,
-            bar.update,
-        )
-    write_graph(graph, out)
-    n_unknown = sum(edge.estimate.is_unknown for edge in graph.edges)
-    n_lost = sum(edge.estimate.is_lost for edge in graph.edges)
-    failed = "".join(f"; {n} {reason.replace('_', ' ')}" for reason, n in graph.failures.items())
-    print(
-        f"{out}: {len(graph.poses)} poses, {len(graph.edges)} edges, of which {n_unknown} are "
-        f"unlike the training data and {n_lost} probably lost{failed}"
+    scans = with_progress(recording, len(recording), recording.name)
+    graph = build_graph(recording, estimator, settings, scans)
+    for out in arguments.out:
+        write_graph(graph, out)
+    print(f"{', '.join(map(str, arguments.out))}: {_sentence(graph)}")
+
+
+def _settings(arguments: argparse.Namespace) -> GraphSettings:
+    """Return what edges are asked for.  Raises RecordingError."""
+    import numpy as np
+
+    from cello3d_ros.evaluation.graph import GraphSettings
+    from cello3d_ros.evaluation.graph_files import read_loops
+    from cello3d_ros.recordings.odometry import Drift
+
+    if arguments.max_gap < 1:
+        raise RecordingError(f"--max-gap must be at least 1: {arguments.max_gap}")
+    drift = None
+    if arguments.odometry_drift is not None:
+        share, deg_per_m, turn_share = arguments.odometry_drift
+        drift = Drift(share, float(np.radians(deg_per_m)), turn_share)
+        if not all(np.isfinite(value) and value >= 0.0 for value in drift):
+            raise RecordingError("--odometry-drift needs three numbers that are not negative")
+        if str(arguments.poses) == "joint":
+            raise RecordingError(
+                "--odometry-drift needs odometry, and --poses joint leaves it out"
+            )
+    return GraphSettings(
+        max_gap=arguments.max_gap,
+        loops={} if arguments.loops is None else read_loops(arguments.loops),
+        registers=arguments.registration == "icp",
+        starts_at_odometry=arguments.poses is None,
+        drift=drift,
+        seed=arguments.seed,
     )
+
+
+def _sentence(graph: Graph) -> str:
+    kinds = [edge.kind for edge in graph.edges]
+    trusts = [edge.trust for edge in graph.edges if edge.trust is not None]
+    text = f"{len(graph.poses)} poses, {len(trusts)} registrations"
+    if n := kinds.count("loop"):
+        text += f" ({n} of loops)"
+    text += f", of which {sum(t.is_unknown for t in trusts)} are unlike the training data and "
+    text += f"{sum(t.is_lost for t in trusts)} probably lost"
+    if n := kinds.count("odometry"):
+        text += f"; {n} steps of odometry"
+    text += "".join(f"; {n} {reason.replace('_', ' ')}" for reason, n in graph.failures.items())
+    if graph.n_parts > 1:
+        text += f"; it falls into {graph.n_parts} parts that no edge connects: solve each alone"
+    return text

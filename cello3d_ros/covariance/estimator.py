@@ -24,12 +24,10 @@ from cello3d_ros.errors import (
     NotConvergedError,
     RegistrationError,
 )
-from cello3d_ros.geometry.gaussian import bounded, to_fixed_axes
+from cello3d_ros.geometry.gaussian import bounded, rotation_first, to_fixed_axes
 from cello3d_ros.geometry.se3 import Array, is_rigid
 from cello3d_ros.registration.backends import register
 from cello3d_ros.registration.icp import Registration
-
-_ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 
 
 class Trust(NamedTuple):
@@ -88,7 +86,7 @@ class Estimate(NamedTuple):
 
         GTSAM perturbs on the same side, ``T exp(xi)``, with the rotation first.
         """
-        return self.covariance[np.ix_(_ROTATION_FIRST, _ROTATION_FIRST)]
+        return rotation_first(self.covariance)
 
     @property
     def trust(self) -> Trust:

@@ -1,179 +1,221 @@
-"""A pose graph of a recording: registrations with their covariances, and files for solvers."""
+"""A pose graph of a recording: measured poses between scans, with their covariances."""
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from cello3d_ros.atomic import new_file
-from cello3d_ros.clouds.shape import prepare
-from cello3d_ros.covariance.estimator import Estimate, Estimator, draws, registered_elsewhere
+from cello3d_ros.clouds.shape import Cloud, prepare
+from cello3d_ros.covariance.case import DEFAULTS
+from cello3d_ros.covariance.estimator import (
+    Estimate,
+    Estimator,
+    Trust,
+    draws,
+    registered_elsewhere,
+)
 from cello3d_ros.errors import Cello3dError, RecordingError
-from cello3d_ros.geometry.gaussian import symmetrized
-from cello3d_ros.geometry.se3 import Array, inverse, quaternion
+from cello3d_ros.geometry.gaussian import bounded
+from cello3d_ros.geometry.se3 import Array, inverse
+from cello3d_ros.recordings.odometry import Drift
 from cello3d_ros.recordings.recording import Recording, Scan
+
+Pairs = Mapping[tuple[int, int], Array | None]  # (i, j): T_ij to start at, None for the poses'
 
 
 class Edge(NamedTuple):
-    """A registration: scan j is the reading, scan i the reference."""
+    """A measured pose of scan j in scan i.
+
+    kind: registration, loop or odometry.  T: (4, 4), ``p_i = T p_j``.  Y: (6, 6), of xi in
+    ``T exp(xi)``, translation first.  trust: of a registration; None of odometry.
+    """
 
     i: int
     j: int
-    estimate: Estimate
+    kind: str
+    T: Array
+    Y: Array
+    trust: Trust | None = None
 
 
 @dataclass
 class Graph:
-    """Poses of scans and the registrations between them.
+    """Scans, by their numbers in the recording, and the edges between them.
 
-    stamps_ns: n; poses: n of (4, 4), in one frame: what registrations started from.
-    failures: how many pairs have no edge, by reason.
+    stamps_ns, poses: of each scan with a pose, (4, 4) in one frame: what registrations start from.
+    failures: how many scans have no pose and how many pairs no edge, by reason.
     """
 
-    stamps_ns: list[int] = field(default_factory=list)
-    poses: list[Array] = field(default_factory=list)
+    stamps_ns: dict[int, int] = field(default_factory=dict)
+    poses: dict[int, Array] = field(default_factory=dict)
     edges: list[Edge] = field(default_factory=list)
     failures: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def n_parts(self) -> int:
+        """Into how many parts it falls that no edge connects."""
+        row = {k: n for n, k in enumerate(self.poses)}
+        ends = np.array([(row[e.i], row[e.j]) for e in self.edges], dtype=int).reshape(-1, 2)
+        links = coo_array((np.ones(len(ends)), ends.T), shape=(len(row), len(row)))
+        return int(connected_components(links, directed=False)[0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraphSettings:
+    """What edges a graph has.
+
+    max_gap: each scan is registered to so many before it.  loops: pairs of scans far apart in
+    time.  registers: whether ICP runs; else the poses are taken as registrations and get
+    covariances.  starts_at_odometry: else at the recorded poses.  drift: of the odometry, whose
+    steps become edges; None for no such edges.  seed: of the random subsamples.
+    """
+
+    max_gap: int = 1
+    loops: Pairs = field(default_factory=dict)
+    registers: bool = True
+    starts_at_odometry: bool = True
+    drift: Drift | None = None
+    seed: int = 0
+
+
+class _Node(NamedTuple):
+    """A scan that waits for its partners.  cloud: None where too little of it is left."""
+
+    T: Array
+    T_odom: Array | None
+    cloud: Cloud | None
+    rng: np.random.Generator
 
 
 def build_graph(
     recording: Recording,
     estimator: Estimator,
-    max_gap: int = 1,
-    registers: bool = True,
-    seed: int = 0,
-    progress: Callable[[int], None] = lambda n: None,
+    settings: GraphSettings | None = None,
+    scans: Iterable[Scan] | None = None,
 ) -> Graph:
-    """Register each scan to the ``max_gap`` before it; the first guesses are the poses of scans.
+    """Register each scan to those before it, and give every pose a covariance.
 
-    Poses are those of odometry, else the recorded ones; scans without are left out and counted.
-    registers: whether ICP runs; else the poses are taken as registrations and get covariances.
-    Raises RecordingError where no scan has a pose or no pair an answer.
+    scans: those of the recording, when something is to see them pass.
+    Scans without a pose are left out and counted, as are pairs without an answer.  Memory holds
+    max_gap scans and those of loops.  Raises RecordingError where no scan has a pose, no pair an
+    answer, a loop names a scan that is not there, or odometry is asked for and there is none.
     """
-    graph, window = Graph(), dict[int, tuple[Scan, Array]]()
-    n = 0
-    for scan in recording:
-        progress(1)
-        T = scan.T_odom_sensor if scan.T_odom_sensor is not None else scan.T_world_sensor
-        if T is None:
+    settings = settings or GraphSettings()
+    _check(recording, settings)
+    graph, waiting = Graph(), dict[int, _Node]()
+    for n, scan in enumerate(recording if scans is None else scans):
+        if (T := _start(scan, settings.starts_at_odometry)) is None:
             graph.failures["no_pose"] += 1
             continue
-        graph.stamps_ns.append(scan.stamp_ns)
-        graph.poses.append(T)
-        window[n] = scan, T
-        window.pop(n - max_gap - 1, None)
-        for i in range(max(0, n - max_gap), n):
-            try:
-                found = _estimate(estimator, window[i], window[n], registers, seed)
-            except Cello3dError as error:
-                graph.failures[error.reason] += 1
-                continue
-            graph.edges.append(Edge(i, n, found))
-        n += 1
+        graph.stamps_ns[n], graph.poses[n] = scan.stamp_ns, T
+        waiting[n] = _node(scan, T, estimator, settings.seed, graph.failures)
+        if settings.drift is not None and n - 1 in waiting:
+            graph.edges += _odometry_edges(n, waiting, settings.drift)
+        for i, j in _pairs(n, settings):
+            if i in waiting and j in waiting:
+                graph.edges += _edges(i, j, waiting, estimator, settings, graph.failures)
+        for k in [k for k in waiting if _last_partner(k, settings) <= n]:
+            del waiting[k]
     if not graph.poses:
         raise RecordingError(
             f"{recording.name} has no poses to start from; name them, or find them (--poses joint)"
         )
-    if not graph.edges:
-        raise RecordingError(f"no pair of {recording.name} has an answer: {dict(graph.failures)}")
+    if not any(edge.kind != "odometry" for edge in graph.edges):
+        reasons = ", ".join(f"{n} {k.replace('_', ' ')}" for k, n in graph.failures.items())
+        raise RecordingError(
+            f"no pair of {recording.name} has an answer: {reasons or 'there is only one scan'}"
+        )
     return graph
+
+
+def _check(recording: Recording, settings: GraphSettings) -> None:
+    n = len(recording)
+    for i, j in settings.loops:
+        if i == j or not (0 <= i < n and 0 <= j < n):
+            raise RecordingError(
+                f"{recording.name} has scans 0 to {n - 1}: there is no loop from {i} to {j}"
+            )
+    if settings.drift is not None and not recording.has_odometry:
+        raise RecordingError(f"{recording.name} has no odometry to make edges of")
+
+
+def _start(scan: Scan, starts_at_odometry: bool) -> Array | None:
+    if starts_at_odometry and scan.T_odom_sensor is not None:
+        return scan.T_odom_sensor
+    return scan.T_world_sensor
+
+
+def _node(scan: Scan, T: Array, estimator: Estimator, seed: int, failures: Counter[str]) -> _Node:
+    rng, cloud = draws(scan.points, seed), None
+    try:
+        cloud = prepare(scan.points, estimator.pipeline.cloud, rng, estimator.settings.n_threads)
+    except Cello3dError as error:
+        failures[error.reason] += 1
+    return _Node(T, scan.T_odom_sensor, cloud, rng)
+
+
+def _pairs(n: int, settings: GraphSettings) -> Iterator[tuple[int, int]]:
+    """Yield the pairs (i, j) whose later scan is n; a loop that is near counts once."""
+    near = [(i, n) for i in range(max(0, n - settings.max_gap), n)]
+    yield from near
+    yield from (p for p in settings.loops if max(p) == n and tuple(sorted(p)) not in near)
+
+
+def _last_partner(k: int, settings: GraphSettings) -> int:
+    return max([k + settings.max_gap, *(max(pair) for pair in settings.loops if k in pair)])
+
+
+def _odometry_edges(n: int, nodes: Mapping[int, _Node], drift: Drift) -> Iterator[Edge]:
+    """Yield the step of the odometry to scan n, where both ends have one."""
+    before, after = nodes[n - 1].T_odom, nodes[n].T_odom
+    if before is not None and after is not None:
+        step = inverse(before) @ after
+        floors = DEFAULTS.floor_sigma_m, DEFAULTS.floor_sigma_rad
+        Y = bounded(np.diag(drift.sigma(step) ** 2), *floors, DEFAULTS.ceiling)
+        yield Edge(n - 1, n, "odometry", step, Y)
+
+
+def _edges(
+    i: int,
+    j: int,
+    nodes: Mapping[int, _Node],
+    estimator: Estimator,
+    settings: GraphSettings,
+    failures: Counter[str],
+) -> Iterator[Edge]:
+    """Yield the registration of scan j to scan i, or count why there is none."""
+    T = settings.loops.get((i, j))
+    if T is None:
+        T = inverse(nodes[i].T) @ nodes[j].T
+    reference, reading = nodes[i].cloud, nodes[j].cloud
+    if reference is None or reading is None:
+        return
+    try:
+        found = _estimate(estimator, reading, reference, T, settings, nodes[j].rng)
+    except Cello3dError as error:
+        failures[error.reason] += 1
+        return
+    kind = "registration" if 0 < j - i <= settings.max_gap else "loop"
+    yield Edge(i, j, kind, found.T_ref_read, found.covariance, found.trust)
 
 
 def _estimate(
     estimator: Estimator,
-    reference: tuple[Scan, Array],
-    reading: tuple[Scan, Array],
-    registers: bool,
-    seed: int,
+    reading: Cloud,
+    reference: Cloud,
+    T: Array,
+    settings: GraphSettings,
+    rng: np.random.Generator,
 ) -> Estimate:
-    (ref, T_ref), (read, T_read) = reference, reading
-    T = np.ascontiguousarray(inverse(T_ref) @ T_read)
-    if registers:
-        return estimator(read.points, ref.points, T, seed)
-    config = estimator.pipeline.cloud
-    P, Q = (prepare(s.points, config, draws(s.points, seed)) for s in (read, ref))
-    return estimator.judge(P, Q, registered_elsewhere(T), draws(read.points, seed))
-
-
-def write_graph(graph: Graph, path: Path) -> None:
-    """Write a graph as its file's ending says: .g2o, .json or .csv.  Raises RecordingError."""
-    if path.suffix not in WRITERS:
-        raise RecordingError(f"{path}: a graph is written as {', '.join(WRITERS)}")
-    with new_file(path) as partial:
-        partial.write_text("".join(WRITERS[path.suffix](graph)), encoding="utf-8")
-
-
-def _g2o(graph: Graph) -> Iterator[str]:
-    """Yield VERTEX_SE3:QUAT and EDGE_SE3:QUAT.
-
-    g2o's error of an edge is ``T_ij^-1 T_i^-1 T_j``, its translation and the vector part of its
-    quaternion, half of the rotation vector: the information of rotations is four times that of
-    rotation vectors.
-    """
-    half = np.diag([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
-    for k, T in enumerate(graph.poses):
-        yield f"VERTEX_SE3:QUAT {k} {_numbers(_pose(T))}\n"
-    for i, j, estimate in graph.edges:
-        information = symmetrized(np.linalg.inv(half @ estimate.covariance @ half))
-        upper = information[np.triu_indices(6)]
-        yield f"EDGE_SE3:QUAT {i} {j} {_numbers([*_pose(estimate.T_ref_read), *upper])}\n"
-
-
-def _json(graph: Graph) -> Iterator[str]:
-    """Yield JSON with the covariances of GTSAM: rotation first, on the side of the reading."""
-    edges = [
-        {
-            "i": i,
-            "j": j,
-            "T": estimate.T_ref_read.ravel().tolist(),
-            "covariance_gtsam": estimate.covariance_gtsam().ravel().tolist(),
-            "overlap": estimate.trust.overlap,
-            "novelty": estimate.trust.novelty,
-            "is_unknown": bool(estimate.is_unknown),
-            "is_lost": bool(estimate.is_lost),
-        }
-        for i, j, estimate in graph.edges
-    ]
-    vertices = [
-        {"stamp_ns": stamp_ns, "T": T.ravel().tolist()}
-        for stamp_ns, T in zip(graph.stamps_ns, graph.poses, strict=True)
-    ]
-    yield json.dumps({"vertices": vertices, "edges": edges}, indent=1) + "\n"
-
-
-def _csv(graph: Graph) -> Iterator[str]:
-    """Yield a row an edge: pose of j in i, covariance (u, omega) on the side of j, row by row."""
-    cells = [f"c{row}{column}" for row in range(6) for column in range(6)]
-    heading = ["i", "j", "stamp_i_ns", "stamp_j_ns", *"xyz", "qx", "qy", "qz", "qw", *cells]
-    yield ",".join([*heading, "overlap", "novelty", "is_unknown", "is_lost"]) + "\n"
-    for i, j, estimate in graph.edges:
-        numbers = [*_pose(estimate.T_ref_read), *estimate.covariance.ravel()]
-        trust = estimate.trust
-        row = [
-            *(i, j, graph.stamps_ns[i], graph.stamps_ns[j]),
-            *(repr(float(number)) for number in numbers),
-            *(repr(float(trust.overlap)), repr(float(trust.novelty))),
-            *(int(trust.is_unknown), int(trust.is_lost)),
-        ]
-        yield ",".join(map(str, row)) + "\n"
-
-
-def _pose(T: Array) -> list[float]:
-    return [*T[:3, 3], *quaternion(T)]
-
-
-def _numbers(values: Sequence[float]) -> str:
-    return " ".join(repr(float(value)) for value in values)
-
-
-WRITERS: dict[str, Callable[[Graph], Iterator[str]]] = {
-    ".g2o": _g2o,
-    ".json": _json,
-    ".csv": _csv,
-}
+    """Return what the estimator says of the two scans when it is called with them and the seed."""
+    T, rng = np.ascontiguousarray(T), deepcopy(rng)
+    if settings.registers:
+        return estimator.register(reading, reference, T, rng)
+    return estimator.judge(reading, reference, registered_elsewhere(T), rng)

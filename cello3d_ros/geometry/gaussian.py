@@ -65,6 +65,12 @@ def to_fixed_axes(R: ArrayLike, Y: ArrayLike) -> Array:
     return symmetrized(B @ np.asarray(Y, dtype=np.float64) @ B.T)
 
 
+def rotation_first(Y: ArrayLike) -> Array:
+    """Return a covariance ordered (u, omega) as (omega, u), which is GTSAM's order.  (6, 6)."""
+    order = [3, 4, 5, 0, 1, 2]
+    return np.asarray(Y, dtype=np.float64)[np.ix_(order, order)]
+
+
 def compound_left(
     T1: ArrayLike, Y1: ArrayLike, T2: ArrayLike, Y2: ArrayLike, order: int = 4
 ) -> GaussianPose:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,29 +16,37 @@ from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings.recording import DerivedRecording, Recording, Scan
 
 
+class Drift(NamedTuple):
+    """How odometry drifts: errors of its steps are independent Gaussian twists on the right."""
+
+    translation_share: float = 0.02
+    rotation_rad_per_m: float = float(np.radians(0.5))
+    rotation_share: float = 0.05
+
+    def sigma(self, motion: ArrayLike) -> Array:
+        """Return the deviations (..., 6), ordered (u, omega), of steps (..., 4, 4).
+
+        Over a length d and an angle a, each axis has the deviation ``translation_share * d`` and
+        ``hypot(rotation_rad_per_m * d, rotation_share * a)``.
+        """
+        xi = se3.log(motion)
+        d = np.linalg.norm(np.asarray(motion, np.float64)[..., :3, 3], axis=-1)
+        a = np.linalg.norm(xi[..., 3:], axis=-1)
+        rotation = np.hypot(self.rotation_rad_per_m * d, self.rotation_share * a)
+        both = np.stack([self.translation_share * d, rotation], axis=-1)
+        return np.repeat(both, 3, axis=-1)
+
+
 def drift_odometry(
-    T_world_sensor: ArrayLike,
-    rng: np.random.Generator,
-    *,
-    translation_share: float = 0.02,
-    rotation_rad_per_m: float = np.radians(0.5),
-    rotation_share: float = 0.05,
+    T_world_sensor: ArrayLike, rng: np.random.Generator, drift: Drift | None = None
 ) -> Array:
     """Return the odometry (n, 4, 4) that a drifting robot would report; it starts at identity.
-
-    Each relative motion is multiplied by ``exp(xi)`` with independent Gaussian xi: over a motion
-    of length d and angle a, each axis has the deviation ``translation_share * d`` and
-    ``hypot(rotation_rad_per_m * d, rotation_share * a)``.
 
     T_world_sensor: (n, 4, 4) ground truth.
     """
     T = np.asarray(T_world_sensor, dtype=np.float64)
     motion = se3.inverse(T[:-1]) @ T[1:]
-    distance = np.linalg.norm(motion[:, :3, 3], axis=1)
-    angle = np.linalg.norm(se3.log(motion)[:, 3:], axis=1)
-    std = np.empty((len(motion), 6))
-    std[:, :3] = (translation_share * distance)[:, None]
-    std[:, 3:] = np.hypot(rotation_rad_per_m * distance, rotation_share * angle)[:, None]
+    std = (drift or Drift()).sigma(motion)
     noisy = motion @ se3.exp(rng.normal(size=std.shape) * std)
     out = [np.eye(4)]
     for step in noisy:

@@ -32,8 +32,8 @@ class Drive:
     sweeps: whether each beam is sent from where the robot is at its own time, and points carry
     times; else a scan is taken at one instant.
     body: whether the scanner sees parts of the robot.
-    odometry_share, odometry_deg_per_m: how odometry drifts from scan to scan, as
-    ``drift_odometry`` says: share of the motion, of length and of angle, and degrees per metre.
+    odometry_share, odometry_deg_per_m: how odometry drifts from scan to scan, as ``Drift`` of
+    ``recordings.odometry`` says: share of the motion, of length and of angle, degrees per metre.
     """
 
     motion: str = "forward"

@@ -13,7 +13,7 @@ from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.recordings.odometry import drift_odometry
+from cello3d_ros.recordings.odometry import Drift, drift_odometry
 from cello3d_ros.recordings.poses import check_order, read_tum
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.recordings.tables import read_bytes
@@ -189,13 +189,8 @@ def _drifting(truth: Array, drive: Drive | None, rng: np.random.Generator) -> Ar
     """Return the odometry (n, 4, 4) of a walk or of a drive."""
     if drive is None:
         return drift_odometry(truth, rng)
-    return drift_odometry(
-        truth,
-        rng,
-        translation_share=drive.odometry_share,
-        rotation_rad_per_m=float(np.radians(drive.odometry_deg_per_m)),
-        rotation_share=drive.odometry_share,
-    )
+    share, deg_per_m = drive.odometry_share, drive.odometry_deg_per_m
+    return drift_odometry(truth, rng, Drift(share, float(np.radians(deg_per_m)), share))
 
 
 def _at(track: PoseTrack, stamp_ns: int, after_s: Array) -> Array:

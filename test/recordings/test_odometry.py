@@ -9,7 +9,7 @@ from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.recordings import Scan, open_recording
 from cello3d_ros.recordings.bag_writer import write_bag
-from cello3d_ros.recordings.odometry import SimulatedOdometry, drift_odometry
+from cello3d_ros.recordings.odometry import Drift, SimulatedOdometry, drift_odometry
 
 
 def walk(n: int, step: float, turn: float):
@@ -35,10 +35,7 @@ def test_odometry_starts_at_identity_whatever_the_first_pose() -> None:
 
 def test_without_noise_odometry_is_ground_truth_seen_from_the_start() -> None:
     truth = walk(20, 0.5, 0.1)
-    odometry = drift_odometry(
-        truth, np.random.default_rng(0),
-        translation_share=0, rotation_rad_per_m=0, rotation_share=0,
-    )  # fmt: skip
+    odometry = drift_odometry(truth, np.random.default_rng(0), Drift(0.0, 0.0, 0.0))
     assert np.allclose(odometry, se3.inverse(truth[0]) @ truth, atol=1e-12)
 
 
