@@ -116,7 +116,7 @@ def _settings(arguments: argparse.Namespace) -> GraphSettings:
 def _sentence(graph: Graph) -> str:
     kinds = [edge.kind for edge in graph.edges]
     trusts = [edge.trust for edge in graph.edges if edge.trust is not None]
-    text = f"{len(graph.poses)} poses, {len(trusts)} registrations"
+    text = f"{len(graph.poses)} poses, {len(trusts)} registration{'s' * (len(trusts) != 1)}"
     if n := kinds.count("loop"):
         text += f" ({n} of loops)"
     text += f", of which {sum(t.is_unknown for t in trusts)} are unlike the training data and "

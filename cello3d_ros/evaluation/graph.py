@@ -110,6 +110,7 @@ def build_graph(
     settings = settings or GraphSettings()
     _check(recording, settings)
     graph, waiting = Graph(), dict[int, _Node]()
+    pairs, last = _pairs(len(recording), settings)
     for n, scan in enumerate(recording if scans is None else scans):
         if (T := _start(scan, settings.starts_at_odometry)) is None:
             graph.failures["no_pose"] += 1
@@ -118,10 +119,10 @@ def build_graph(
         waiting[n] = _node(scan, T, estimator, settings.seed, graph.failures)
         if settings.drift is not None and n - 1 in waiting:
             graph.edges += _odometry_edges(n, waiting, settings.drift)
-        for i, j in _pairs(n, settings):
+        for i, j in pairs[n]:
             if i in waiting and j in waiting:
                 graph.edges += _edges(i, j, waiting, estimator, settings, graph.failures)
-        for k in [k for k in waiting if _last_partner(k, settings) <= n]:
+        for k in [k for k in waiting if last[k] <= n]:
             del waiting[k]
     if not graph.poses:
         raise RecordingError(
@@ -161,15 +162,18 @@ def _node(scan: Scan, T: Array, estimator: Estimator, seed: int, failures: Count
     return _Node(T, scan.T_odom_sensor, cloud, rng)
 
 
-def _pairs(n: int, settings: GraphSettings) -> Iterator[tuple[int, int]]:
-    """Yield the pairs (i, j) whose later scan is n; a loop that is near counts once."""
-    near = [(i, n) for i in range(max(0, n - settings.max_gap), n)]
-    yield from near
-    yield from (p for p in settings.loops if max(p) == n and tuple(sorted(p)) not in near)
+def _pairs(n: int, settings: GraphSettings) -> tuple[list[list[tuple[int, int]]], list[int]]:
+    """Return for each of n scans the pairs (i, j) that it completes, and its last partner.
 
-
-def _last_partner(k: int, settings: GraphSettings) -> int:
-    return max([k + settings.max_gap, *(max(pair) for pair in settings.loops if k in pair)])
+    A loop that is near counts once.
+    """
+    pairs = [[(i, j) for i in range(max(0, j - settings.max_gap), j)] for j in range(n)]
+    last = [k + settings.max_gap for k in range(n)]
+    for i, j in settings.loops:
+        if abs(i - j) > settings.max_gap:
+            pairs[max(i, j)].append((i, j))
+            last[min(i, j)] = max(last[min(i, j)], i, j)
+    return pairs, last
 
 
 def _odometry_edges(n: int, nodes: Mapping[int, _Node], drift: Drift) -> Iterator[Edge]:

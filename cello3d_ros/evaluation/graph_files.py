@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -44,8 +45,11 @@ def check_graph_file(path: Path) -> None:
     """Raise RecordingError where a graph cannot be written to a path."""
     if path.suffix not in WRITERS:
         raise RecordingError(f"{path}: a graph is written as {', '.join(WRITERS)}")
-    if path.is_dir() or not path.absolute().parent.is_dir():
+    folder = path.absolute().parent
+    if path.is_dir() or not folder.is_dir():
         raise RecordingError(f"cannot write {path}: not a file in an existing folder")
+    if not os.access(folder, os.W_OK):
+        raise RecordingError(f"cannot write {path}: its folder cannot be written to")
 
 
 def write_graph(graph: Graph, path: Path) -> None:

@@ -279,7 +279,7 @@ def test_scans_without_a_pose_and_pairs_without_an_answer_are_counted(
     edges = graph(tmp_path / "mine", tmp_path / "g.json", *flags)
     assert [(e["i"], e["j"]) for e in edges] == [(2, 3)]
     told = capsys.readouterr().out
-    assert "4 poses, 1 registrations" in told
+    assert "4 poses, 1 registration," in told
     assert "1 no pose" in told
     assert "falls into 3 parts that no edge connects" in told
     out = ("--out", tmp_path / "g.txt")
