@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cello3d_ros.cli.sources import add_source_arguments, open_source
+from cello3d_ros.cli.sources import add_source_arguments, in_words, open_source
 from cello3d_ros.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -28,7 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="POSES",
         type=Path,
         required=True,
-        help="TUM file to write; further parts become POSES.2.tum and so on",
+        help="TUM file to write, or KITTI's if it ends in .txt; further parts become POSES.2.tum "
+        "and so on",
     )
     add_source_arguments(parser)
     parser.add_argument("--report", metavar="FILE", type=Path, help="JSON of every scan, to write")
@@ -62,11 +63,18 @@ def run(arguments: argparse.Namespace) -> None:
             n_threads=arguments.jobs,
             progress=progress,
         )
-    written = write_poses(arguments.out, found)
+    written = write_poses(arguments.out, found, recording.n_declared)
     if arguments.report is not None:
         _write_json(arguments.report, as_dict(found))
     shutil.rmtree(folder, ignore_errors=True)
-    print("\n".join([", ".join(map(str, written)), *sentences(found)]))
+    print(", ".join(map(str, written)) + in_words(recording.skipped))
+    if arguments.out not in written:
+        n = len(found.members())
+        print(
+            f"{arguments.out} is not written: KITTI's format has a row for each scan, and "
+            f"{n} of {recording.n_declared} have a pose"
+        )
+    print("\n".join(sentences(found)))
 
 
 def joint(

@@ -46,6 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
     """
     from cello3d_ros.config import PIPELINE, Config, NodeConfig, load_config
     from cello3d_ros.covariance.model import load_model
+    from cello3d_ros.recordings.start_poses import PosesAsOdometry
     from cello3d_ros.tracking.offline import replay
     from cello3d_ros.tracking.tracker import Tracker
 
@@ -53,6 +54,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.extrinsic is None and node.T_base_sensor != NodeConfig().T_base_sensor:
         arguments.extrinsic = node.T_base_sensor
     recording = open_source(arguments.recording, arguments)
+    if arguments.poses is not None and arguments.odometry is None:
+        recording = PosesAsOdometry(recording)
     node = replace(node, T_base_sensor=_extrinsic(recording, arguments.extrinsic))
     model = load_model(arguments.model)
     config = Config(**{name: getattr(model.pipeline, name) for name in PIPELINE}, node=node)

@@ -41,7 +41,8 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
         "--poses",
         type=Path,
         metavar="FILE",
-        help="ground truth: a TUM file, or KITTI's by order; in graph also the word joint",
+        help="ground truth: a TUM file, or KITTI's by order; replay takes them for "
+        "odometry; in graph also the word joint",
     )
     parser.add_argument("--time-field", metavar="NAME", help="field with the times of the points")
     parser.add_argument("--time-unit", choices=("s", "ms", "us", "ns"), help="their unit")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -96,10 +96,23 @@ def sentences(found: Tuning) -> Iterator[str]:
         f"{after.dm2_over_6:.2f}, in 95 %: {before.coverage_95:.2f} -> {after.coverage_95:.2f}, "
         f"KL {before.kl_median:.2f} -> {after.kl_median:.2f} (median of {before.n_pairs} pairs)"
     )
-    if found.dropped:
-        named = ", ".join(f"{i}-{j}" for _, i, j in found.dropped[:10])
-        more = " ..." if len(found.dropped) > 10 else ""
+    if found.rejected:
         yield (
-            f"{len(found.dropped)} pairs not used, their registrations do not agree with their "
-            f"poses: {named}{more}"
+            f"{len(found.rejected)} pairs not used, sampling gave them no covariance: "
+            f"{_named(found.rejected)}"
         )
+    if found.flagged:
+        yield (
+            f"{len(found.flagged)} pairs not used, their registrations do not agree with their "
+            f"poses: {_named(found.flagged)}"
+        )
+    if found.outliers:
+        yield (
+            f"{len(found.outliers)} pairs judged but not fitted to, their registrations scatter "
+            f"far more than those of the others: {_named(found.outliers)}"
+        )
+
+
+def _named(pairs: Sequence[tuple[str, int, int]]) -> str:
+    more = " ..." if len(pairs) > 10 else ""
+    return ", ".join(f"{i}-{j}" for _, i, j in pairs[:10]) + more

@@ -8,18 +8,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cello3d_ros.atomic import new_file
-from cello3d_ros.recordings.poses import tum_line
+from cello3d_ros.recordings.poses import kitti_line, tum_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from cello3d_ros.learning.align import Alignment
 
+KITTI = ".txt"
 _MOST_NAMED = 10
 
 
-def write_poses(path: Path, alignment: Alignment) -> list[Path]:
-    """Write a TUM file for each part, the longest to ``path``; return their paths."""
+def write_poses(path: Path, alignment: Alignment, n_scans: int) -> list[Path]:
+    """Write a TUM file for each part, the longest to ``path``; return their paths.
+
+    ``.txt`` is a KITTI file: a row a scan without stamps.  Where not all ``n_scans`` of the
+    recording have a pose in one part no such file can be written, and TUM files are.
+    """
+    if path.suffix == KITTI:
+        if len(alignment.members()) == n_scans:
+            with new_file(path) as partial:
+                partial.write_text("".join(map(kitti_line, alignment.poses)), encoding="utf-8")
+            return [path]
+        path = path.with_suffix(".tum")
     numbers = range(2, alignment.n_parts + 1)
     paths = [path, *(path.with_suffix(f".{number}.tum") for number in numbers)]
     for part, file in enumerate(paths):

@@ -27,12 +27,14 @@ from cello3d_ros.learning.examples import (
 )
 from cello3d_ros.learning.measures import Figures, figures, pose_check, select
 
+PairKey = tuple[str, int, int]
+
 N_BLOCKS = 4  # of time, each held back once
 SIZE, EXAMPLES = "size", "examples"
 _FEWEST_PAIRS = 12
 _FEWEST_FOR_EXAMPLES = 60
 _GAIN = 0.95  # of the KL of the size alone, that examples must reach
-_OUTLIER = 30.0  # times the median misfit: a pair whose pose is wrong or whose ICP is lost
+_OUTLIER = 30.0  # times the median misfit: a pair that is not fitted to, but judged
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,8 +43,11 @@ class Tuning:
 
     kind: SIZE, or EXAMPLES where the recording's own pairs joined those of the model as well.
     scale: factor on every covariance of the model.  before, after: figures of the model as it was
-    and as tuned on the other blocks.  dropped: pairs that were not used, whose registrations do
-    not agree with their pose.
+    and as tuned on the other blocks, over every pair that was held back but the flagged.
+    rejected: pairs to which sampling gave no covariance.
+    flagged: pairs that were not used, whose registrations do not agree with their pose
+    (``pose_check``).  outliers: pairs that were judged but not fitted to, 30 times as far from the
+    model as the median pair.
     """
 
     model: Model
@@ -50,7 +55,9 @@ class Tuning:
     scale: float
     before: Figures
     after: Figures
-    dropped: tuple[tuple[str, int, int], ...]
+    rejected: tuple[PairKey, ...]
+    flagged: tuple[PairKey, ...]
+    outliers: tuple[PairKey, ...]
 
 
 def tune(model: Model, dataset: Dataset) -> Tuning:
@@ -59,18 +66,18 @@ def tune(model: Model, dataset: Dataset) -> Tuning:
     Raises DatasetError where the dataset's settings are not the model's, and for fewer than 12
     pairs that can be used.
     """
-    keys = [key for key in dataset.pair_keys() if dataset.read(*key).accepted]
+    found = dataset.pair_keys()
+    rejected, keys = _split(found, np.array([not dataset.read(*key).accepted for key in found]))
     examples = select_inputs(load_examples([dataset], {key[0] for key in keys}), model.features)
     _check(model, examples, len(keys))
-    F = predictions(model, examples)
-    keep = _usable(F, examples)
-    dropped = tuple(key for key, kept in zip(keys, keep, strict=True) if not kept)
-    keys = [key for key, kept in zip(keys, keep, strict=True) if kept]
-    examples, F = select(examples, keep), F[keep]
+    agrees = np.array([not pose_check(xi).flagged for xi in examples.xi], np.bool_)
+    flagged, keys = _split(keys, ~agrees)
+    examples = select(examples, agrees)
     _check(model, examples, len(keys))
-    blocks = list(_blocks(keys))
+    F = predictions(model, examples)
     scaled, extended_F = np.full_like(F, np.nan), np.full_like(F, np.nan)
-    for held, rest in blocks:
+    for held, rest in _blocks(keys):
+        rest[rest] = _fits(F[rest], select(examples, rest))
         ours, theirs = select(examples, rest), select(examples, held)
         scale = _scale(F[rest], ours)
         scaled[held] = scale * F[held]
@@ -78,21 +85,27 @@ def tune(model: Model, dataset: Dataset) -> Tuning:
     judged = np.asarray(np.isfinite(scaled).all(axis=(1, 2)))
     if not judged.any():
         raise DatasetError("the pairs all share scans: no block of time can be held back")
-    Y = examples.covariances[judged]
+    held_back, before = select(examples, judged), F[judged]
     scaled, extended_F = scaled[judged], extended_F[judged]
-    may_extend = len(keys) >= _FEWEST_FOR_EXAMPLES
+    fits = _fits(F, examples)
+    outliers, fitted = _split(keys, ~fits)
+    examples, F = select(examples, fits), F[fits]
+    Y = held_back.covariances
+    may_extend = len(fitted) >= _FEWEST_FOR_EXAMPLES
     pays = _mean_kl(Y, extended_F) < _GAIN * _mean_kl(Y, scaled)
     kind = EXAMPLES if may_extend and pays else SIZE
     scale = _scale(F, examples)
     tuned = extended(model, examples, scale) if kind == EXAMPLES else resized(model, scale)
     tuned = _knowing(tuned, model, examples)
     return Tuning(
-        model=replace(tuned, provenance=_provenance(model, dataset, keys, kind, scale)),
+        model=replace(tuned, provenance=_provenance(model, dataset, fitted, kind, scale)),
         kind=kind,
         scale=scale,
-        before=figures(F[judged], select(examples, judged)),
-        after=figures(extended_F if kind == EXAMPLES else scaled, select(examples, judged)),
-        dropped=dropped,
+        before=figures(before, held_back),
+        after=figures(extended_F if kind == EXAMPLES else scaled, held_back),
+        rejected=tuple(rejected),
+        flagged=tuple(flagged),
+        outliers=tuple(outliers),
     )
 
 
@@ -154,11 +167,16 @@ def _check(model: Model, examples: Examples, n_pairs: int) -> None:
         raise DatasetError("the model's examples are turned otherwise than the dataset's")
 
 
-def _usable(F: Array, examples: Examples) -> NDArray[np.bool_]:
-    """Return which pairs fit the model to a factor, or registrations that agree with the pose."""
+def _fits(F: Array, examples: Examples) -> NDArray[np.bool_]:
+    """Return which pairs are no farther from the model than 30 times the median pair."""
     misfit = _misfit(F, examples)
-    agrees = np.array([not pose_check(xi).flagged for xi in examples.xi])
-    return np.asarray(agrees & (misfit < _OUTLIER * np.median(misfit)))
+    return np.asarray(misfit < _OUTLIER * np.median(misfit))
+
+
+def _split(keys: Sequence[PairKey], out: NDArray[np.bool_]) -> tuple[list[PairKey], list[PairKey]]:
+    """Return the keys that are out, and those that are not."""
+    pairs = list(zip(keys, out, strict=True))
+    return [key for key, is_out in pairs if is_out], [key for key, is_out in pairs if not is_out]
 
 
 def _misfit(F: Array, examples: Examples) -> Array:
@@ -179,7 +197,7 @@ def _mean_kl(Y: Array, F: Array) -> float:
 
 
 def _blocks(
-    keys: Sequence[tuple[str, int, int]],
+    keys: Sequence[PairKey],
 ) -> Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
     """Return for each block of time its pairs, and those that share no scan with them."""
     names, references, readings = zip(*keys, strict=True)
@@ -200,7 +218,7 @@ def _blocks(
 def _provenance(
     model: Model,
     dataset: Dataset,
-    keys: Sequence[tuple[str, int, int]],
+    keys: Sequence[PairKey],
     kind: str,
     scale: float,
 ) -> dict[str, Any]:

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.recordings.poses import read_poses
@@ -26,6 +28,22 @@ def start_track(path: Path, recording: Recording) -> PoseTrack:
     if all(track.near(scan.stamp_ns) is None for scan in recording):
         raise RecordingError(f"{path}: no pose has the time of any scan of {recording.name}")
     return track
+
+
+class PosesAsOdometry(DerivedRecording):
+    """A recording whose ground truth takes the place of its odometry."""
+
+    has_odometry = True
+
+    def __iter__(self) -> Iterator[Scan]:
+        for scan in self.recording:
+            yield replace(scan, T_odom_sensor=scan.T_world_sensor)
+
+    def track(self) -> PoseTrack | None:
+        """Return the poses at the stamps of the scans."""
+        posed = [scan for scan in self if scan.T_odom_sensor is not None]
+        T = np.array([scan.T_odom_sensor for scan in posed]).reshape(-1, 4, 4)
+        return PoseTrack.of_poses([scan.stamp_ns for scan in posed], T)
 
 
 class PosedRecording(DerivedRecording):

@@ -1,6 +1,7 @@
 """``cello3d align``: files, words and errors."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from cello3d_ros.cli.main import main
 from cello3d_ros.geometry.se3 import exp, inverse, log, pose, transform
 from cello3d_ros.recordings import Scan
-from cello3d_ros.recordings.poses import read_tum, tum_line
+from cello3d_ros.recordings.poses import read_poses, read_tum, tum_line
 from cello3d_ros.recordings.writers import write_folder
 from cello3d_ros.tracking.warmup import room
 
@@ -72,6 +73,31 @@ def test_poses_given_by_file_are_the_start(
     given.write_text("".join(tum_line((k + 90) * 10**9, T[k]) for k in range(N)))
     assert main(["align", str(recording), "--poses", str(given), "--out", str(out)]) == 1
     assert "no pose has the time of any scan of mine" in capsys.readouterr().err
+
+
+def test_a_txt_file_has_a_row_of_kitti_for_each_scan(recording: Path, tmp_path: Path) -> None:
+    tum, kitti = tmp_path / "poses.tum", tmp_path / "poses.txt"
+    for out in (tum, kitti):
+        assert main(["align", str(recording), "--out", str(out)]) == 0
+    rows = read_tum(tum.read_bytes(), tum).rows
+    found, _ = read_poses(kitti)
+    np.testing.assert_allclose(found, pose(rows[:, :3], rows[:, 3:]), atol=1e-12)
+
+
+def test_a_cloud_without_a_finite_point_is_counted_and_kitti_rows_would_shift(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy, out = tmp_path / "copy", tmp_path / "poses.txt"
+    shutil.copytree(recording, copy)
+    clouds = sorted(copy.glob("*.npy"))
+    np.save(clouds[2], np.full((100, 3), np.nan))
+    assert main(["align", str(copy), "--out", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert f"{tmp_path / 'poses.tum'}; 1 message left out: malformed" in told
+    assert "poses.txt is not written: KITTI's format has a row for each scan, and 4 of 5" in told
+    assert not out.exists()
+    stamps = read_tum((tmp_path / "poses.tum").read_bytes(), out).stamps_ns
+    assert stamps == [(k + 1) * 10**8 for k in range(N) if k != 2]
 
 
 def test_too_few_scans_and_a_missing_folder_are_one_sentence(

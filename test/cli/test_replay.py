@@ -16,7 +16,7 @@ from cello3d_ros.geometry.gaussian import to_fixed_axes
 from cello3d_ros.geometry.se3 import exp, inverse, pose, transform
 from cello3d_ros.recordings import Scan
 from cello3d_ros.recordings.bag_writer import write_bag
-from cello3d_ros.recordings.poses import read_tum
+from cello3d_ros.recordings.poses import kitti_line, read_tum
 from cello3d_ros.tracking.warmup import room
 
 N = 6
@@ -200,6 +200,24 @@ def test_recorded_poses_as_external_registrations_are_the_result(tmp_path, model
     for i, line in enumerate(map(json.loads, lines), start=1):
         T = exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.1]) * i) @ exp(drift * i)
         assert np.allclose(np.reshape(line["T_odom_read"], (4, 4)), T, atol=1e-9)
+
+
+@pytest.mark.parametrize("odometry", [True, False])
+def test_poses_by_file_take_the_place_of_odometry(tmp_path, model, odometry) -> None:
+    """Also of odometry that a bag has, unless it is asked for by name."""
+    bag = walk(tmp_path / "walk", odometry=odometry)
+    T = [exp(np.array([0.21, 0.0, 0.0, 0.0, 0.0, 0.1]) * i) for i in range(N)]
+    (tmp_path / "slam.txt").write_text("".join(map(kitti_line, T)))
+    (tmp_path / "c.yaml").write_text("node: {registration: external}\n")
+    words = ["replay", str(bag), "--model", str(model), "--config", str(tmp_path / "c.yaml")]
+    words += ["--poses", str(tmp_path / "slam.txt")]
+    assert main([*words, "--out", str(tmp_path / "r")]) == 0
+    for i, line in enumerate(lines_of(tmp_path / "r")[1:], start=1):
+        assert np.allclose(np.reshape(line["T_odom_read"], (4, 4)), T[i], atol=1e-9)
+    if odometry:
+        assert main([*words, "--out", str(tmp_path / "own"), "--odometry", "/odom"]) == 0
+        last = np.reshape(lines_of(tmp_path / "own")[-1]["T_odom_read"], (4, 4))
+        assert not np.allclose(last, T[-1], atol=1e-3)
 
 
 def test_no_answer_at_all_is_an_error_and_leaves_nothing(tmp_path, model, capsys) -> None:
