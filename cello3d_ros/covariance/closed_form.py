@@ -29,7 +29,8 @@ class ClosedForm(NamedTuple):
     sandwich: ``H^-1 (sum_i g_i g_i^T) H^-1``, what redrawing the reading does to the result to
     first order, g_i being the gradient that one reading point adds; trim_m: the distance up to
     which ICP's rules keep associations; residual_rms_m: root mean square of their point-to-plane
-    residuals; n_associations: how many there are.
+    residuals; n_associations: how many there are; free: the directions of the sensor that no plane
+    holds, names of ``x y z roll pitch yaw``: along them both are too small.
     """
 
     inverse_H: Array
@@ -37,6 +38,7 @@ class ClosedForm(NamedTuple):
     trim_m: float
     residual_rms_m: float
     n_associations: int
+    free: tuple[str, ...] = ()
 
 
 def closed_form(
@@ -50,7 +52,7 @@ def closed_form(
 
     overlap: the clouds' associations.  H is the point-to-plane normal matrix of those that
     ICP's rules keep.  ICP draws n_reading_points of the reading's N points, so both are scaled by
-    N / n_reading_points.  Raises FreeDirectionError when the geometry leaves a direction free.
+    N / n_reading_points.  Raises FreeDirectionError where H is singular.
     """
     assert has_shape(reference)
     limit2 = _trim_limit(overlap.distances2, config)
@@ -67,7 +69,6 @@ def closed_form(
         limit2,
         weights,
     )
-    _check_that_planes_hold(H, _tilted(reading.points, weights))
     inverse_H = _inverse(H)
     drawn = _drawn(reading, config)
     return ClosedForm(
@@ -76,6 +77,7 @@ def closed_form(
         np.sqrt(limit2),
         np.sqrt(sum2 / max(n, 1)),
         n,
+        _not_held(H, _tilted(reading.points, weights)),
     )
 
 
@@ -174,10 +176,9 @@ def _inverse(H: Array) -> Array:
     """Return ``H^-1``.  Raises FreeDirectionError if it is singular, whatever the units."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(H * np.outer(scale, scale))
-    if not eigenvalues[0] > 1e-10 * eigenvalues[-1]:
-        raise FreeDirectionError(
-            "the overlap leaves a direction free: the normal equations of ICP are singular"
-        )
+    free = ~(eigenvalues > 1e-10 * eigenvalues[-1])
+    if free.any():
+        raise free_error(_named(vectors[:, free]))
     return np.asarray(np.outer(scale, scale) * ((vectors / eigenvalues) @ vectors.T))
 
 
@@ -204,8 +205,8 @@ def _tilted(points: Array, weights: Array) -> Array:
     return N
 
 
-def _check_that_planes_hold(H: Array, N: Array) -> None:
-    """Raise FreeDirectionError where H has little more than errors of the normals explain.
+def _not_held(H: Array, N: Array) -> tuple[str, ...]:
+    """Name the directions where H has little more than errors of the normals explain.
 
     H, N: (6, 6), the normal matrix and the part of it that such errors would make.  A direction v
     is free where ``v^T H v < _HELD v^T N v``: about ``N / H`` of a motion along it is not seen.
@@ -218,13 +219,22 @@ def _check_that_planes_hold(H: Array, N: Array) -> None:
     root = np.linalg.inv(np.linalg.cholesky(N + least * np.eye(6)))
     held, vectors = np.linalg.eigh(root @ H @ root.T)
     free = held < _HELD
-    if free.any():
-        directions, _ = np.linalg.qr(root.T @ vectors[:, free])
-        shares = (directions**2).sum(axis=1)
-        named = [name for name, share in zip(_AXES, shares) if share > 0.25]
-        raise FreeDirectionError(
-            f"no plane of the overlap holds {', '.join(named)} of the sensor: free here"
-        )
+    if not free.any():
+        return ()
+    directions, _ = np.linalg.qr(root.T @ vectors[:, free])
+    return _named(directions)
+
+
+def free_error(directions: tuple[str, ...]) -> FreeDirectionError:
+    """Return the error that names what is free."""
+    named = ", ".join(directions)
+    return FreeDirectionError(f"no plane of the overlap holds {named} of the sensor: free here")
+
+
+def _named(directions: Array) -> tuple[str, ...]:
+    """Name the axes that take part in orthonormal directions, (6, n)."""
+    shares = (directions**2).sum(axis=1)
+    return tuple(name for name, share in zip(_AXES, shares) if share > 0.25)
 
 
 @kernel()

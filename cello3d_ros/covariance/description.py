@@ -23,7 +23,7 @@ class Description(NamedTuple):
     descriptors: (n_rotations, n_features), the k-th after a turn of the reading frame by
     2 pi k / n_rotations about z; features: the numbers that ``FEATURES`` names; shapes: cheap
     predictors by name, each (6, 6), reading side; overlap: the associations that all of it comes
-    from.
+    from; free: the directions of the sensor that no plane holds (``ClosedForm``).
     """
 
     n_overlap: int
@@ -32,6 +32,7 @@ class Description(NamedTuple):
     features: Array
     shapes: dict[str, Array]
     overlap: Overlap
+    free: tuple[str, ...] = ()
 
 
 def describe(
@@ -46,7 +47,7 @@ def describe(
 
     T_ref_read: (4, 4); n_rotations: 0 where nobody looks at descriptors, which then are not made;
     n_threads changes no result.  Raises NoOverlapError when too little overlaps and
-    RegistrationError when the geometry leaves a direction free.
+    FreeDirectionError when the normal equations are singular.
     """
     radius_m, k = pipeline.overlap.radius_m, pipeline.icp.n_neighbors
     overlap = find_overlap(reading, reference, T_ref_read, radius_m, k, n_threads)
@@ -55,7 +56,9 @@ def describe(
     shapes = {"hessian": found.inverse_H, "sandwich": found.sandwich}
     descriptors = _descriptors(reading, reference, T_ref_read, overlap, pipeline, n_rotations)
     features = global_features(reading, reference, T_ref_read, overlap, found, pipeline.icp)
-    return Description(overlap.n_points, overlap.ratio, descriptors, features, shapes, overlap)
+    return Description(
+        overlap.n_points, overlap.ratio, descriptors, features, shapes, overlap, found.free
+    )
 
 
 def turns(n_rotations: int) -> Array:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from cello3d_ros.clouds.shape import Cloud, filtered, with_shape
 from cello3d_ros.config import Pipeline
 from cello3d_ros.covariance.case import DEFAULTS, Case, MethodSettings
+from cello3d_ros.covariance.closed_form import free_error
 from cello3d_ros.covariance.description import describe
 from cello3d_ros.covariance.lost import covering, is_lost
 from cello3d_ros.covariance.methods import ASK_MODEL, METHODS, predicted, widened
@@ -250,6 +251,8 @@ class Estimator:
             n_rotations=1 if _looks_at_descriptor(model) else 0,
             n_threads=self.settings.n_threads,
         )
+        if description.free:
+            raise free_error(description.free)
         if not registration.converged:
             raise NotConvergedError(
                 f"ICP did not converge in {registration.n_iterations} iterations: start it nearer "

@@ -13,11 +13,11 @@ def cloud(points):
 
 
 def test_a_point_beyond_the_radius_is_outside():
-    near = cloud([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
-    far = cloud([[0, 0.2, 0], [1, 0.05, 0], [9, 0, 0]])
+    near = cloud([[0, 0, 1], [1, 0, 1], [2, 3, 1]])
+    far = cloud([[0, 0.2, 1], [1, 0.05, 1], [9, 0, 1]])
     overlap = find_overlap(near, far, np.eye(4), 0.1)
-    assert near.points[overlap.reading].tolist() == [[1, 0, 0]]
-    assert far.points[overlap.reference].tolist() == [[1, 0.05, 0]]
+    assert near.points[overlap.reading].tolist() == [[1, 0, 1]]
+    assert far.points[overlap.reference].tolist() == [[1, 0.05, 1]]
     assert overlap.n_points == 2
     assert overlap.ratio == 1 / 3
 

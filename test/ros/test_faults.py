@@ -224,7 +224,7 @@ def corridor(rng: np.random.Generator, x: float) -> np.ndarray:
 
 
 def test_a_scene_that_degenerates_and_recovers(tmp_path, domain_id) -> None:
-    """In a corridor without ends the uncertainty along it is large and said to be so."""
+    """Nothing holds the way along a corridor without ends: no answer there, and one after."""
     model = tmp_path / "sandwich.npz"
     save_model(constant_model(np.eye(6), 704, shape="sandwich"), model)
     player = Player(domain_id, "/aware_node")
@@ -233,24 +233,28 @@ def test_a_scene_that_degenerates_and_recovers(tmp_path, domain_id) -> None:
         with _named("aware_node", tmp_path / "log", domain_id, model) as process:
             _connect(robot, process)
             at_home = _weakest(robot, robot.points)
-            inside = _weakest(robot, lambda: corridor(rng, 0.0))
+            inside = _walk(robot, lambda: corridor(rng, 0.0), "free_direction")
             again = _weakest(robot, robot.points)
             assert process.stop() == 0
     finally:
         player.close()
-    assert abs(inside[1][0]) > 0.99
-    assert inside[0] > 5.0 * at_home[0]
-    assert again[0] < 2.0 * at_home[0]
+    assert inside["last_event"] == "free_direction"
+    assert again < 2.0 * at_home
     robot.assert_sane()
 
 
-def _weakest(robot: Robot, points: Callable[[], np.ndarray]) -> tuple[float, list[float]]:
-    """Walk on into the new scene; return the largest sigma and its direction when answered."""
+def _walk(robot: Robot, points: Callable[[], np.ndarray], event: str) -> dict[str, str]:
+    """Walk on into the new scene until something becomes of a cloud; return the status then."""
     for n in range(20):
         robot.step()
         status = robot.send(points())
-        if n > 3 and status["last_event"] == "answered":  # the old reference is given up by then
+        if n > 3 and status["last_event"] == event:  # the old reference is given up by then
             break
+    return status
+
+
+def _weakest(robot: Robot, points: Callable[[], np.ndarray]) -> float:
+    """Walk on into the new scene; return the largest sigma when a cloud is answered."""
+    status = _walk(robot, points, "answered")
     assert status["last_event"] == "answered"
-    direction = [float(word) for word in status["weakest_direction"].split()]
-    return float(status["weakest_sigma_m"]), direction
+    return float(status["weakest_sigma_m"])
