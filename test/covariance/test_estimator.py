@@ -109,8 +109,9 @@ def test_a_registration_from_elsewhere_is_judged_as_it_is(pair):
 
 def test_an_estimate_is_by_the_method_that_it_names(pair):
     model = constant_model(2.0 * np.eye(6), 704, shape="sandwich")
+    bare = MethodSettings(floor_sigma_m=1e-9, floor_sigma_rad=1e-9)
     found = {
-        name: Estimator(model, name).register(*pair, T_TRUE, np.random.default_rng(1))
+        name: Estimator(model, name, bare).register(*pair, T_TRUE, np.random.default_rng(1))
         for name in ("cello3d", "fused", "sigma_points", "censi", "hessian", "constant")
     }
     assert set(found) <= set(METHODS)
