@@ -225,7 +225,7 @@ class PairingConfig(Section):
 
     pairing: str = _setting(
         "consecutive",
-        "what a cloud is registered to: the one before, a keyframe, or the topic reference_points",
+        "what a cloud is registered to: the last that moved, a keyframe or reference_points",
         choices=("consecutive", "keyframe", "topics"),
     )
     keyframe_distance_m: float = _setting(1.0, "distance that makes a new keyframe", 0.0)

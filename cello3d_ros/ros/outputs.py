@@ -95,14 +95,14 @@ def _pose(
 
 
 def _twist(answer: Answer, config: NodeConfig) -> tuple[Array, Array]:
-    """Return the twist (6,) of the registered step and its covariance (6, 6), along its own axes.
+    """Return the twist (6,) since the scan before and its covariance (6, 6), along its own axes.
 
-    Zero with the largest covariance where the reference is no scan shortly before: unknown.
+    Zero with the largest covariance where the motion since then is unknown.
     """
-    if answer.span_s is None:
+    if answer.motion is None or answer.span_s is None:
         return np.zeros(6), config.ceiling * np.eye(6)
-    C = twist_covariance(answer.step.Y, answer.span_s, *_bounds(config))
-    return log(answer.step.T) / answer.span_s, C
+    C = twist_covariance(answer.motion.Y, answer.span_s, *_bounds(config))
+    return log(answer.motion.T) / answer.span_s, C
 
 
 def _bounds(config: NodeConfig) -> tuple[float, float, float]:

@@ -8,11 +8,13 @@ from cello3d_ros.config import CloudConfig, PairingConfig
 from cello3d_ros.covariance.estimator import Estimate
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry import se3
-from cello3d_ros.geometry.gaussian import GaussianPose
+from cello3d_ros.geometry.gaussian import GaussianPose, mahalanobis
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.tracking.chain import Chain, Frame, Link
 from cello3d_ros.tracking.guess import ODOMETRY
 from cello3d_ros.tracking.map import Map
+
+_MOVED = 3.0  # errors of a well calibrated model reach this once in 10^8 scans
 
 
 class NoReferenceError(RegistrationError):
@@ -22,7 +24,11 @@ class NoReferenceError(RegistrationError):
 
 
 class Consecutive:
-    """Each scan is registered to the one answered before it."""
+    """Each scan is registered to the one answered before it that was elsewhere.
+
+    While the sensor stands still, all are registered to one scan: small errors of one sign, which
+    ICP makes at rest, then do not add up.
+    """
 
     map_frame = ""  # the frame that answers are in where the reference is a map
     needs_chain = True  # whether a pause or a break of the odometry leaves nothing to register to
@@ -47,8 +53,9 @@ class Consecutive:
         return self._reference
 
     def accept(self, link: Link, found: Estimate, config: PairingConfig) -> None:
-        """Note an answered scan."""
-        self._reference = link
+        """Note an answered scan; one that has moved is the next reference."""
+        if has_moved(found) or makes_keyframe(found, config):
+            self._reference = link
 
     def fail(self, chain: Chain) -> None:
         """Note a scan that did not fit."""
@@ -60,7 +67,7 @@ class Keyframe(Consecutive):
 
     def accept(self, link: Link, found: Estimate, config: PairingConfig) -> None:
         """Note an answered scan; one far enough from the keyframe is the next keyframe."""
-        if makes_keyframe(found.registration.T_ref_read, found.overlap_ratio, config):
+        if makes_keyframe(found, config):
             self._reference = link
 
 
@@ -128,12 +135,21 @@ class ToMap(Consecutive):
 PAIRINGS = {"consecutive": Consecutive, "keyframe": Keyframe, "topics": ToMap}
 
 
-def makes_keyframe(T_ref_read: Array, overlap_ratio: float, config: PairingConfig) -> bool:
+def has_moved(found: Estimate) -> bool:
+    """Return whether a scan is farther from its reference than errors explain.
+
+    That is ``_MOVED`` standard deviations along each of six axes, as one number.
+    """
+    distance = mahalanobis(se3.log(found.T_ref_read), found.covariance)
+    return bool(distance > _MOVED * np.sqrt(6.0))
+
+
+def makes_keyframe(found: Estimate, config: PairingConfig) -> bool:
     """Return whether a registered scan is far enough from its keyframe to be the next one."""
-    way_m = np.linalg.norm(T_ref_read[:3, 3])
-    angle_rad = np.linalg.norm(se3.log(T_ref_read)[3:])
+    way_m = np.linalg.norm(found.T_ref_read[:3, 3])
+    angle_rad = np.linalg.norm(se3.log(found.T_ref_read)[3:])
     return bool(
         way_m > config.keyframe_distance_m
         or angle_rad > config.keyframe_angle_rad
-        or overlap_ratio < config.keyframe_min_overlap
+        or found.overlap_ratio < config.keyframe_min_overlap
     )

@@ -18,7 +18,7 @@ from cello3d_ros.covariance.case import MethodSettings
 from cello3d_ros.covariance.estimator import Estimate, Estimator, draws, needs_shape
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import ModelError, RegistrationError
-from cello3d_ros.geometry.gaussian import GaussianPose, extended
+from cello3d_ros.geometry.gaussian import GaussianPose, extended, to_left
 from cello3d_ros.geometry.se3 import Array, inverse, log
 from cello3d_ros.geometry.transforms import seen_from_base
 from cello3d_ros.tracking.agreement import (
@@ -56,10 +56,10 @@ class Answer:
 
     estimate: of the sensor at the two scans.  step: the pose of ``child_frame_id`` at the reading
     in ``frame_id``, by this registration; pose: its accumulated pose in ``pose_frame_id``; both as
-    they are published, with right covariances.  span_s: the time between the two scans, None where
-    the reference is not a scan shortly before.  guess: where the first guess came from.  offset:
-    (6,), the twist by which ICP would move an external pose, else None.  disagreement: why
-    odometry contradicts it, in a sentence, or "".
+    they are published, with right covariances.  motion: the pose of ``child_frame_id`` seen from
+    where it was at the scan answered before, span_s earlier; both None where that is unknown.
+    guess: where the first guess came from.  offset: (6,), the twist by which ICP would move an
+    external pose, else None.  disagreement: why odometry contradicts it, in a sentence, or "".
     """
 
     stamp_ns: int
@@ -70,6 +70,7 @@ class Answer:
     frame_id: str = "lidar"
     pose_frame_id: str = "odom"
     child_frame_id: str = "lidar"
+    motion: GaussianPose | None = None
     span_s: float | None = None
     guess: str = ODOMETRY
     offset: Array | None = None
@@ -84,6 +85,8 @@ class _Found(NamedTuple):
     guess: str
     offset: Array | None = None
     disagreement: str = ""
+    motion: GaussianPose | None = None
+    span_s: float | None = None
 
 
 class Tracker:
@@ -96,6 +99,7 @@ class Tracker:
         self.last_restart = ""
         self._pairing = PAIRINGS[config.pairing]()
         self._chain = Chain()
+        self._before: tuple[Link, GaussianPose] | None = None  # the last reference and step
         self._rival: Link | None = None  # failed against a first scan that nothing has fitted
         self._alternation = Alternation()
 
@@ -150,6 +154,7 @@ class Tracker:
             self._begin(rival)
             found, reference = match, rival
         pose = extended(reference.pose, found.step)
+        found = self._with_motion(frame, found, reference)
         self._accept(frame, found, reference, pose)
         return self._published(frame, found, reference, pose)
 
@@ -242,6 +247,29 @@ class Tracker:
             T_init = on_the_floor(flat, _ORIGIN, reading.place.T_base_sensor).T
         return T_init, CONSTANT_VELOCITY
 
+    def _with_motion(self, frame: Frame, found: _Found, reference: Link) -> _Found:
+        """Return a registration with the motion since the scan before, where that is known.
+
+        Where both have been registered to one scan it is the difference of the two, in which what
+        they share cancels; its covariance is that of two that share nothing, hence not too small.
+        """
+        newest, before, step = self._chain.newest, self._before, found.step
+        self._before = reference, step
+        if newest is None or self._pairing.map_frame:
+            return found
+        if newest.frame is not reference.frame:
+            if before is None or before[0] is not reference:
+                return found
+            T = inverse(before[1].T) @ step.T
+            step = GaussianPose(T, step.Y + to_left(inverse(T), before[1].Y))
+        span_s = 1e-9 * (frame.stamp_ns - newest.frame.stamp_ns)
+        if not 0.0 < span_s <= self.config.max_pair_gap_s:
+            return found
+        if self.config.output_frame == "base":
+            extrinsics = newest.frame.place.T_base_sensor, frame.place.T_base_sensor
+            step = seen_from_base(*step, *extrinsics)
+        return found._replace(motion=step, span_s=span_s)
+
     def _accept(self, frame: Frame, found: _Found, reference: Link, pose: GaussianPose) -> None:
         """Take an answered scan into the chain, and as the next reference if it is one."""
         T_odom_ref = reference.frame.T_odom_sensor
@@ -259,12 +287,9 @@ class Tracker:
         place, step, X_ref = frame.place, found.step, reference.frame.place.T_base_sensor
         child = place.base_frame if self.config.output_frame == "base" else place.sensor_frame
         frame_id, pose_frame_id = child, place.odom_frame
-        span_s: float | None = 1e-9 * (frame.stamp_ns - reference.frame.stamp_ns)
         if map_frame := self._pairing.map_frame:
-            step, X_ref, span_s = GaussianPose(pose.T, step.Y), _ORIGIN, None
+            step, X_ref = GaussianPose(pose.T, step.Y), _ORIGIN
             frame_id = pose_frame_id = map_frame
-        elif span_s is not None and not 0.0 < span_s <= self.config.max_pair_gap_s:
-            span_s = None
         if self.config.output_frame == "base":
             step = seen_from_base(*step, X_ref, place.T_base_sensor)
             pose = seen_from_base(*pose, _ORIGIN, place.T_base_sensor)
@@ -277,7 +302,8 @@ class Tracker:
             frame_id=frame_id,
             pose_frame_id=pose_frame_id,
             child_frame_id=child,
-            span_s=span_s,
+            motion=found.motion,
+            span_s=found.span_s,
             guess=found.guess,
             offset=found.offset,
             disagreement=found.disagreement,

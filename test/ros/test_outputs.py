@@ -22,10 +22,11 @@ def answer(span_s: float | None = 0.1, Y_step: np.ndarray = Y) -> Answer:
     registration = Registration(STEP, 7, True, "", 0.02, 900)
     found = Estimate(registration, 0.8, Y_step, 0.5, 4.0)
     step, pose = GaussianPose(STEP, Y_step), GaussianPose(STEP @ STEP, 2.0 * Y)
-    return Answer(101 * S, 100 * S, found, step, pose, span_s=span_s)
+    motion = None if span_s is None else step
+    return Answer(101 * S, 100 * S, found, step, pose, motion=motion, span_s=span_s)
 
 
-def test_the_twist_is_the_step_over_its_time() -> None:
+def test_the_twist_is_the_motion_over_its_time() -> None:
     twist, C = outputs._twist(answer(), NodeConfig())
     np.testing.assert_allclose(se3.exp(0.1 * twist), STEP, atol=1e-12)
     np.testing.assert_allclose(C, 100.0 * Y, rtol=1e-9)

@@ -248,13 +248,13 @@ def test_a_long_pause_starts_a_new_chain(tracker, asked) -> None:
 
 def test_the_same_scans_give_the_same_answers_whatever_came_before(tracker) -> None:
     rng = np.random.default_rng(4)
-    scans = [room(rng), room(rng), room(rng)]
-    tracker.step(0, scans[0], Place(POSES[0]))
-    tracker.step(S, scans[1], Place(POSES[0]))
-    first = tracker.step(2 * S, scans[2], Place(POSES[0]))
+    scans = [se3.transform(se3.inverse(T), room(rng)) for T in POSES[:3]]
+    places = [Place(T) for T in POSES[:3]]
+    for i in range(3):
+        first = tracker.step(i * S, scans[i], places[i])
     tracker.reset()
-    tracker.step(S, scans[1], Place(POSES[0]))
-    again = tracker.step(2 * S, scans[2], Place(POSES[0]))
+    for i in range(1, 3):
+        again = tracker.step(i * S, scans[i], places[i])
     np.testing.assert_array_equal(
         first.estimate.registration.T_ref_read, again.estimate.registration.T_ref_read
     )
@@ -517,13 +517,27 @@ def test_a_covariance_that_cannot_be_published_has_a_reason_of_its_own() -> None
     assert CovarianceError("not finite").reason == "covariance"
 
 
-def test_a_step_has_a_time_only_where_its_reference_is_a_scan_shortly_before(asked) -> None:
-    keyframes = tracker_with(pairing="keyframe", max_pair_gap_s=5.0)
-    spans = [keyframes.step(i * S, POINTS, Place(np.eye(4))) for i in range(8)]
-    assert [answer.span_s for answer in spans[1:]] == [1.0, 2.0, 3.0, 4.0, 5.0, None, None]
+def test_the_motion_since_the_scan_before_is_known_except_after_a_break_or_on_a_map(
+    asked, monkeypatch
+) -> None:
+    monkeypatch.setitem(globals(), "WIDE", 1e-4 * np.eye(6))
+    for pairing, distance_m in (("consecutive", 1.0), ("keyframe", 1e9)):
+        tracker = tracker_with(pairing=pairing, keyframe_distance_m=distance_m)
+        for i, T in enumerate(SMALL_STEPS):
+            answer = tracker.step(i * S, POINTS, Place(T))
+        moved = se3.inverse(SMALL_STEPS[-2]) @ SMALL_STEPS[-1]
+        assert answer.span_s == 1.0
+        assert answer.reference_ns == (3 * S if pairing == "consecutive" else 0)
+        np.testing.assert_allclose(answer.motion.T, moved, atol=1e-12)
+        Ad = se3.adjoint(se3.inverse(moved))
+        shared = 0.0 if pairing == "consecutive" else Ad @ WIDE @ Ad.T
+        np.testing.assert_allclose(answer.motion.Y, WIDE + shared, atol=1e-12)
     on_map = tracker_with(pairing="topics")
     on_map.take_map(7, MAP, "map")
-    assert on_map.step(S, POINTS, Place(IN_MAP)).span_s is None
+    for i in range(3):
+        answer = on_map.step(i * S, POINTS, Place(IN_MAP))
+        assert answer.motion is None
+        assert answer.span_s is None
 
 
 @pytest.mark.parametrize("pairing_name", ["consecutive", "keyframe"])
@@ -582,6 +596,7 @@ def test_a_planar_robot_has_z_roll_and_pitch_of_its_odometry(asked, monkeypatch)
     monkeypatch.setattr(
         module.Estimator, "register", lambda self, P, Q, T, rng: fixed(self, P, Q, T @ error, rng)
     )
+    monkeypatch.setitem(globals(), "WIDE", 1e-4 * np.eye(6))
     tracker = tracker_with(planar=True)
     turns = [se3.exp([0.3 * i, 0, 0, 0, 0, 0.1 * i]) for i in range(4)]
     for i, T in enumerate(turns):
