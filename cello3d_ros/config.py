@@ -49,6 +49,13 @@ class CloudConfig(Section):
 
     min_range_m: float = _setting(0.5, "points nearer to the sensor are dropped", 0.0)
     max_range_m: float = _setting(100.0, "points farther from the sensor are dropped", 0.0)
+    min_support: float = _setting(
+        0.0,
+        "against snow, rain and dust, 0.05: a point is dropped unless this share of the points in "
+        "its direction is about as far away; 0 drops none",
+        0.0,
+        1.0,
+    )
     voxel_m: float = _setting(0.2, "side of the cubes in which density is bounded", 1e-3)
     max_points_per_voxel: int = _setting(4, "points kept in one cube, drawn at random", 1)
     n_neighbors: int = _setting(20, "neighbours of a normal and its features", 3, 64)

@@ -13,6 +13,7 @@ from cello3d_ros.clouds.covariances import covariances
 from cello3d_ros.clouds.filters import crop_range, is_planar, limit_density
 from cello3d_ros.clouds.leaves import WIDTH
 from cello3d_ros.clouds.neighbors import KdTree, build_tree
+from cello3d_ros.clouds.particles import without_particles
 from cello3d_ros.compiled import kernel
 from cello3d_ros.config import CloudConfig
 from cello3d_ros.errors import CloudError, PlanarCloudError
@@ -55,6 +56,8 @@ def filtered(
 ) -> Cloud:
     """Do the first part of ``prepare``: a cloud whose local shape nobody knows yet."""
     cropped = crop_range(points, config.min_range_m, config.max_range_m)
+    if config.min_support > 0.0:
+        cropped = without_particles(cropped, config.min_support)
     kept = limit_density(cropped, config.voxel_m, config.max_points_per_voxel, rng)
     if len(kept) < config.n_neighbors:
         raise CloudError(
