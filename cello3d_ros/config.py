@@ -220,6 +220,11 @@ class InputConfig(Section):
     odometry_timeout_s: float = _setting(0.5, "wait for odometry after a cloud's stamp", 0.0, 60.0)
     odometry_gap_s: float = _setting(1.0, "odometry farther apart is not interpolated", 0.0)
     odometry_buffer_s: float = _setting(10.0, "odometry remembered", 0.1, 3600.0)
+    deskew: bool = _setting(
+        True,
+        "undo the motion of the sensor within a cloud whose points have times, by odometry or the "
+        "last registration; false where the driver has done it",
+    )
     cloud_time_offset_s: float = _setting(
         0.0, "added to the stamps of clouds: a constant delay, or a clock of PTP or since boot"
     )

@@ -165,6 +165,7 @@ def _as_dict(answer: Answer) -> dict[str, Any]:
     return {
         "stamp_ns": answer.stamp_ns,
         "reference_ns": answer.reference_ns,
+        "deskewed": answer.deskewed,
         **found._replace(registration=registration, covariance=step.Y).to_dict(),
         "T_odom_read": answer.pose.T.ravel().tolist(),
         "Y_chain": answer.pose.Y.ravel().tolist(),

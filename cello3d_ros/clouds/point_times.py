@@ -13,6 +13,7 @@ from cello3d_ros.errors import CloudError, ConfigError
 from cello3d_ros.geometry.se3 import Array
 
 NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "time_stamp", "time_in_sec")
+N_FIRST = 10  # clouds from which it is seen how times are to be read
 INTENSITIES = ("intensity", "intensities", "reflectivity")
 UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 
@@ -24,6 +25,7 @@ _MAX_SPAN_S = 100.0  # of a scan, where the time between clouds is not known,
 _MAX_SCAN_S = 10.0  # and where it is
 _MOST = 1.5  # times the time between clouds is the most that a scan spans
 _WHOLE = (0.2, 1.2)  # and what the scan of a lidar that turns all the time spans
+_UNKNOWN_PERIOD_S = 1.0  # the time between clouds of which only one has come is at most about this
 _SHORTEST_S = 0.1  # a scan is at least so long when clocks are compared
 
 
@@ -164,6 +166,36 @@ def recognise(
     if abs(1e-9 * ns * (float(base) + float(middle))) <= reach_s:
         return TimeLaw(ns, STAMP, reach_s)
     return TimeLaw(ns, EPOCH if abs(1e-9 * after_stamp_ns(ns)) <= reach_s else FIRST, reach_s)
+
+
+class TimesOfClouds:
+    """Reads the times of clouds as they come, by the law of a recording that begins with them.
+
+    The law of each of the first ten clouds is that of the clouds so far; then it stays.
+    """
+
+    def __init__(self) -> None:
+        self._stamps: list[int] = []
+        self._law: TimeLaw | None = None
+        self._kind: Any = None
+
+    def read(self, values: NDArray[Any], stamp_ns: int) -> Array:
+        """Return the times (N,) of the next cloud, as ``relative_s``.
+
+        Raises PointTimesError where they fit no law; the next cloud is looked at afresh.
+        """
+        if self._kind != values.dtype or (self._stamps and stamp_ns < self._stamps[-1]):
+            self._stamps, self._law, self._kind = [], None, values.dtype
+        if self._law is None:
+            self._stamps = [*self._stamps, stamp_ns][-N_FIRST:]
+            steps = np.diff(self._stamps)
+            steps = steps[steps > 0]
+            period_s = 1e-9 * float(np.median(steps)) if len(steps) else _UNKNOWN_PERIOD_S
+            law = recognise(values, stamp_ns, period_s)
+            if len(self._stamps) < N_FIRST:
+                return relative_s(values, law, stamp_ns)
+            self._law = law
+        return relative_s(values, self._law, stamp_ns)
 
 
 def relative_s(values: NDArray[Any], law: TimeLaw, stamp_ns: int) -> Array:

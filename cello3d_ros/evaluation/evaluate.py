@@ -30,11 +30,12 @@ from cello3d_ros.evaluation.online import answers, prepared
 from cello3d_ros.evaluation.result import Evaluation, Group, Pair, Poses, ShownPair, Trajectory
 from cello3d_ros.evaluation.trajectories import consistency, length_m, odometry_runs, shown
 from cello3d_ros.learning.aligned import aligned_parts, joint_folder
-from cello3d_ros.learning.dataset import Dataset, open_dataset
+from cello3d_ros.learning.dataset import UNDONE, Dataset, open_dataset
 from cello3d_ros.learning.examples import Examples, load_examples
 from cello3d_ros.learning.identity import prints_of
 from cello3d_ros.learning.measures import pose_check
 from cello3d_ros.recordings import Recording, open_recording
+from cello3d_ros.recordings.deskew import without_motion
 
 Key = tuple[str, int, int]  # recording, i, j
 Progress = Callable[[str, int, int], None]  # recording, pairs done, pairs in all
@@ -175,6 +176,8 @@ def _recordings(
             )
         found[recording.name] = recording
         for dataset in datasets:
+            if dataset.recordings.get(recording.name, {}).get("motion") == UNDONE:
+                found[recording.name] = without_motion(recording)
             if dataset.recordings.get(recording.name, {}).get("poses") == "joint":
                 folder = joint_folder(dataset.path, recording.name)
                 parts = aligned_parts(recording, folder, dataset.pipeline)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry import se3
+from cello3d_ros.geometry.motion import Motion
 from cello3d_ros.geometry.se3 import Array
 
 GAP_S = 2.0  # poses farther apart are not interpolated, if nothing else is said
@@ -237,28 +238,25 @@ class PoseTrack:
         stamps = self._stamps[first : last + 1]
         return all(b - a <= 1e9 * self.gap_s for a, b in itertools.pairwise(stamps))
 
-    def motion(self, stamp_ns: int, after_s: ArrayLike) -> Array:
-        """Return ``T(stamp)^-1 T(stamp + after)`` (n, 4, 4), on the geodesics of SE(3).
+    def covers_sweep(self, stamp_ns: int, first_s: float, last_s: float) -> bool:
+        """Return whether there is a pose at a stamp and from ``first_s`` to ``last_s`` after."""
+        return self.covers(*_ends_ns(stamp_ns, first_s, last_s))
 
-        Between two poses of the track ``T(t) = T_0 exp(s log(T_0^-1 T_1))``.  after_s: (n,), all
-        covered by the track.
+    def motion(self, stamp_ns: int, first_s: float, last_s: float) -> Motion:
+        """Return the motion seen from a stamp, from ``first_s`` to ``last_s`` after it.
+
+        Between two poses of the track it is the geodesic ``T_0 exp(s log(T_0^-1 T_1))`` of SE(3).
+        All of these times are covered by the track.
         """
-        after = np.append(0.0, np.asarray(after_s, dtype=np.float64))
         if len(self) == 1:
-            return np.tile(np.eye(4), (len(after) - 1, 1, 1))
-        ends_ns = (
-            stamp_ns + math.floor(after.min() * 1e9),
-            stamp_ns + math.ceil(after.max() * 1e9),
-        )
-        first, last = self._around(*ends_ns)
+            return Motion.constant(np.zeros(6))
+        first, last = self._around(*_ends_ns(stamp_ns, first_s, last_s))
         stamps = np.array(self._stamps[first : last + 1], dtype=np.int64)
         at_s = 1e-9 * (stamps - stamp_ns).astype(np.float64)
-        k = np.clip(np.searchsorted(at_s, after, side="right") - 1, 0, len(at_s) - 2)
-        knots = np.stack([self._pose(i) for i in range(first, last + 1)])
-        steps = se3.log(se3.inverse(knots[:-1]) @ knots[1:])
-        share = (after - at_s[k]) / (at_s[k + 1] - at_s[k])
-        T = knots[k] @ se3.exp(share[:, None] * steps[k])
-        return np.asarray(se3.inverse(T[0]) @ T[1:])
+        T = np.stack([self._pose(i) for i in range(first, last + 1)])
+        velocity = se3.log(se3.inverse(T[:-1]) @ T[1:]) / np.diff(at_s)[:, None]
+        there = Motion(at_s[:-1], T[:-1], velocity)
+        return there._replace(T=se3.inverse(there.at([0.0])) @ there.T)
 
     def is_constant(self, tolerance: float = 1e-6) -> bool:
         """Return whether all poses are alike to a tolerance, in metres and entries of R."""
@@ -286,3 +284,9 @@ class PoseTrack:
         if stamp_ns > self._stamps[-1]:
             late_s = 1e-9 * (stamp_ns - self._stamps[-1])
             raise PoseNotYetError(f"the newest {self.what} is {late_s:.3f} s older")
+
+
+def _ends_ns(stamp_ns: int, first_s: float, last_s: float) -> tuple[int, int]:
+    """Return the first and the last time of a sweep and its stamp."""
+    first, last = math.floor(min(first_s, 0.0) * 1e9), math.ceil(max(last_s, 0.0) * 1e9)
+    return stamp_ns + first, stamp_ns + last

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.filters import crop_range, limit_density, subsample
+from cello3d_ros.clouds.motion import undistorted
 from cello3d_ros.config import CloudConfig
 from cello3d_ros.errors import CloudError
-from cello3d_ros.geometry.se3 import Array, exp
+from cello3d_ros.geometry.motion import Motion
+from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.recordings.recording import Scan
 
 _MAX_POINTS = 20_000  # of a scan: with its neighbours they are 17 times as many
-_N_BINS = 512  # of the times of a scan, in each of which the motion is one pose
-
 
 _Single = tuple[NDArray[np.float32], NDArray[np.float32]]  # points and normals
 
@@ -101,9 +101,11 @@ def filtered_scan(scan: Scan, config: CloudConfig, rng: np.random.Generator) -> 
 
     Raises CloudError when fewer than ``n_neighbors`` are left.
     """
+    if scan.time_s is not None:
+        scan = scan.only(np.isfinite(scan.time_s))
     points = crop_range(scan.points, config.min_range_m, config.max_range_m)
     time_s = scan.time_s
-    if time_s is not None and np.ptp(time_s) > 0.0:
+    if time_s is not None and len(time_s) and np.ptp(time_s) > 0.0:
         range2 = np.einsum("ij,ij->i", scan.points, scan.points)
         time_s = time_s[(range2 >= config.min_range_m**2) & (range2 <= config.max_range_m**2)]
         rows = np.column_stack([points, time_s])
@@ -119,14 +121,11 @@ def filtered_scan(scan: Scan, config: CloudConfig, rng: np.random.Generator) -> 
     return RawScan(kept[:, :3].copy(), kept[:, 3].copy() if kept.shape[1] == 4 else None)
 
 
-def undistorted(scan: RawScan, velocity: Array) -> Array:
+def without_motion(scan: RawScan, velocity: Array) -> Array:
     """Return the points (N, 3) as the sensor would have seen them at the stamp.
 
     velocity: (6,), of the sensor in its own frame, m/s and rad/s: ``p' = exp(time v) p``.
     """
     if scan.time_s is None or not velocity.any():
         return scan.points
-    edges = np.linspace(scan.time_s.min(), scan.time_s.max(), _N_BINS)
-    bins = np.rint((scan.time_s - edges[0]) / max(edges[1] - edges[0], 1e-12)).astype(np.int64)
-    T = exp(edges[:, None] * velocity)[bins]
-    return np.asarray(np.einsum("nij,nj->ni", T[:, :3, :3], scan.points) + T[:, :3, 3])
+    return undistorted(scan.points, scan.time_s, Motion.constant(velocity))

@@ -13,7 +13,7 @@ from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig, Pipeline
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log, transform
 from cello3d_ros.learning.align_chain import MIN_SHARE, share_on_surfaces
-from cello3d_ros.learning.align_scans import ScanStore, ShapedScan, undistorted
+from cello3d_ros.learning.align_scans import ScanStore, ShapedScan, without_motion
 from cello3d_ros.registration.icp import register
 
 N_BEFORE = 8  # neighbours of a scan on either side
@@ -164,4 +164,4 @@ def motion_of(
 
 def own_points(store: ScanStore, k: int, velocity: Array) -> Array:
     """Return the points of scan k without the motion within it."""
-    return undistorted(store.raw(k), velocity)
+    return without_motion(store.raw(k), velocity)

@@ -12,7 +12,7 @@ import numpy as np
 from cello3d_ros.config import Pipeline
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.learning.align import Alignment, Progress, align
-from cello3d_ros.learning.align_scans import RawScan, undistorted
+from cello3d_ros.learning.align_scans import RawScan, without_motion
 from cello3d_ros.learning.align_sweeps import motion_of
 from cello3d_ros.recordings.recording import Recording, Scan
 
@@ -58,8 +58,9 @@ class AlignedPart:
                 continue
             points = scan.points
             if found.compensated and scan.time_s is not None:
+                scan = scan.only(np.isfinite(scan.time_s))
                 velocity = motion_of(k, found.poses, found.stamps_ns, members)
-                points = undistorted(RawScan(points, scan.time_s), velocity)
+                points = without_motion(RawScan(scan.points, scan.time_s), velocity)
             T = found.poses[k]
             yield replace(scan, points=points, time_s=None, T_world_sensor=T, T_odom_sensor=None)
 

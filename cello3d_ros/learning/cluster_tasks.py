@@ -33,6 +33,7 @@ from cello3d_ros.learning.sampling import (
     sample_pair,
 )
 from cello3d_ros.recordings import open_recording
+from cello3d_ros.recordings.deskew import without_motion
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.simulation.rescan import rescannable
 from cello3d_ros.simulation.scanner import Echoes
@@ -135,7 +136,8 @@ class _Reader:
     """
 
     def __init__(self, path: str, rescan: bool = False) -> None:
-        self._recording = rescannable(path) if rescan else open_recording(path)
+        found = rescannable(path) if rescan else open_recording(path)
+        self._recording = without_motion(found)
         self._scans = iter(self._recording)
         self._n_read = 0
         self._recent: dict[int, Scan] = {}

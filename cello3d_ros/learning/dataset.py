@@ -31,6 +31,7 @@ from cello3d_ros.geometry.gaussian import is_positive_definite
 from cello3d_ros.geometry.se3 import Array
 
 FORMAT = 2
+UNDONE = "undone"  # the fact "motion" of a recording: points are as seen at the stamps
 CONVENTIONS = (
     "T_ref_read maps reading points into the reference frame; xi = (u, omega) = "
     "log(inverse(T_mean) T_hat); covariances about ground truth, on the reading side"

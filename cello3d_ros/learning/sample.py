@@ -12,10 +12,11 @@ from threadpoolctl import threadpool_limits
 from cello3d_ros.config import Config, pipeline_of
 from cello3d_ros.errors import ConfigError, RecordingError
 from cello3d_ros.learning.aligned import AlignedPart, pose_facts
-from cello3d_ros.learning.dataset import Dataset, PairRecord, open_dataset
+from cello3d_ros.learning.dataset import UNDONE, Dataset, PairRecord, open_dataset
 from cello3d_ros.learning.identity import fingerprint, scan_prints
 from cello3d_ros.learning.sampling import Progress, pairs, sample_recording
 from cello3d_ros.recordings import Recording, open_recording
+from cello3d_ros.recordings.deskew import WithoutMotion, without_motion
 from cello3d_ros.simulation.rescan import rescannable
 from cello3d_ros.simulation.simulation import Simulation
 
@@ -80,7 +81,8 @@ def _opened(paths: Sequence[Path | str | Recording], rescan: bool) -> dict[str, 
     opened: dict[str, Recording] = {}
     for path in paths:
         if isinstance(path, str | Path):
-            opened[str(path)] = (rescannable if rescan else open_recording)(Path(path))
+            found = (rescannable if rescan else open_recording)(Path(path))
+            opened[str(path)] = without_motion(found)
         else:
             opened[path.name] = path
     names = Counter(recording.name for recording in opened.values())
@@ -102,9 +104,12 @@ def _add(dataset: Dataset, recording: Recording) -> None:
     """Write down what tells this recording from others of its name."""
     facts: dict[str, Any] = {"n_scans": len(recording), "fingerprint": fingerprint(recording)}
     known = dataset.recordings.get(recording.name, {})
-    if scans := known.get("scans") or scan_prints(recording):
+    as_recorded = recording.recording if isinstance(recording, WithoutMotion) else recording
+    if scans := known.get("scans") or scan_prints(as_recorded):
         facts["scans"] = scans
     source = recording
+    if isinstance(recording, WithoutMotion):
+        facts["motion"] = UNDONE
     if isinstance(recording, AlignedPart):
         source = recording.recording
         facts |= pose_facts(recording)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cello3d_ros.clouds import livox
 from cello3d_ros.clouds.point_times import (
     INTENSITIES,
+    N_FIRST,
     Clock,
     PointTimesError,
     TimeLaw,
@@ -37,8 +38,6 @@ from cello3d_ros.recordings.bag_reader import (
 )
 from cello3d_ros.recordings.recording import LenientRecording, ReadOptions, Scan, Skips
 from cello3d_ros.recordings.topics import POSE_TYPES, TF_STATIC, TF_TYPES, choose
-
-_N_FIRST = 10  # clouds from which it is seen how times are to be read
 
 
 class _Message(NamedTuple):
@@ -150,7 +149,7 @@ class BagRecording(LenientRecording):
 
     def _law(self) -> TimeLaw | None:
         first = []
-        for message in islice(self._messages({self.topics.points}), _N_FIRST):
+        for message in islice(self._messages({self.topics.points}), N_FIRST):
             if message.kind in livox.TYPES:
                 return TimeLaw(1)
             try:

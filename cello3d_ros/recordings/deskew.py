@@ -1,4 +1,4 @@
-"""Undistorts scans: each point moved to where the sensor would have seen it at the stamp."""
+"""Scans without the motion within them, by the times of their points and a recording's poses."""
 
 from __future__ import annotations
 
@@ -7,29 +7,27 @@ from dataclasses import replace
 
 import numpy as np
 
+from cello3d_ros.clouds.motion import sweep_of, undistorted
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.pose_track import PoseTrack
-from cello3d_ros.recordings.recording import Recording, Scan
+from cello3d_ros.recordings.recording import NOT_READ, DerivedRecording, Recording, Scan
 
 
 def deskew(scan: Scan, track: PoseTrack) -> Scan | None:
-    """Return the scan with ``p' = T(stamp)^-1 T(stamp + time) p``, without times.
+    """Return the scan with each point as seen from the sensor at the stamp, without times.
 
     Points whose time is damaged are left out.  Returns None when the track does not cover the
-    whole scan.  Raises RecordingError when the
-    points have no times.
+    whole scan.  Raises RecordingError when the points have no times.
     """
     if scan.time_s is None:
         raise RecordingError("the points have no times that could be recognised")
     scan = scan.only(np.isfinite(scan.time_s))
     assert scan.time_s is not None
-    first, last = float(scan.time_s.min(initial=0.0)), float(scan.time_s.max(initial=0.0))
-    ends = (scan.stamp_ns + int(np.floor(first * 1e9)), scan.stamp_ns + int(np.ceil(last * 1e9)))
-    if not track.covers(*ends):
+    sweep_s = sweep_of(scan.time_s)
+    if not track.covers_sweep(scan.stamp_ns, *sweep_s):
         return None
-    T = track.motion(scan.stamp_ns, scan.time_s)
-    points = np.einsum("nij,nj->ni", T[:, :3, :3], scan.points) + T[:, :3, 3]
-    return replace(scan, points=points, time_s=None)
+    motion = track.motion(scan.stamp_ns, *sweep_s)
+    return replace(scan, points=undistorted(scan.points, scan.time_s, motion), time_s=None)
 
 
 def deskewed(recording: Recording) -> Iterator[Scan]:
@@ -49,3 +47,36 @@ def deskewed(recording: Recording) -> Iterator[Scan]:
             yield straight
     if n == 0:
         raise RecordingError(f"the poses of {recording.name} do not cover any of its scans")
+
+
+class WithoutMotion(DerivedRecording):
+    """A recording whose scans are without the motion within them, where its poses cover them."""
+
+    def __init__(self, recording: Recording, track: PoseTrack) -> None:
+        super().__init__(recording)
+        self._track = track
+
+    @property
+    def times(self) -> str:
+        """Nothing: they have served."""
+        return ""
+
+    def __iter__(self) -> Iterator[Scan]:
+        for scan in self.recording:
+            straight = None if scan.time_s is None else deskew(scan, self._track)
+            yield scan if straight is None else straight
+
+    def track(self) -> PoseTrack:
+        """As of the recording."""
+        return self._track
+
+
+def without_motion(recording: Recording) -> Recording:
+    """Return the recording without the motion within its scans.
+
+    It is returned as it is where its points have no times that can be read, or it has no poses.
+    """
+    if not recording.times or recording.times.startswith(NOT_READ):
+        return recording
+    track = recording.track()
+    return recording if track is None else WithoutMotion(recording, track)

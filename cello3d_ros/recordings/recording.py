@@ -19,6 +19,8 @@ from cello3d_ros.geometry.se3 import Array
 if TYPE_CHECKING:
     from cello3d_ros.geometry.pose_track import PoseTrack
 
+NOT_READ = "not read"  # how ``Recording.times`` begins where times cannot be read
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scan:
@@ -192,7 +194,7 @@ class LenientRecording(ABC):
         except PointTimesError as error:
             if self._clock.is_given:
                 raise RecordingError(f"{self._where}: {error}") from None
-            return None, f"not read: {error}"
+            return None, f"{NOT_READ}: {error}"
         return law, "" if law is None else law.sentence
 
     def _law(self) -> TimeLaw | None:

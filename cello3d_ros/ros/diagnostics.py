@@ -181,6 +181,7 @@ def _described(answer: Answer, C: Array) -> dict[str, str]:
     return {
         "reference_stamp_ns": str(answer.reference_ns),
         "guess": answer.guess,
+        "deskewed": answer.deskewed,
         "overlap_ratio": f"{found.overlap_ratio:.4f}",
         "residual_rms_m": f"{found.registration.residual_rms_m:.6f}",
         "iterations": str(found.registration.n_iterations),

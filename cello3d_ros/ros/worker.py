@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 
-from cello3d_ros.clouds.livox import read_livox
-from cello3d_ros.clouds.pointcloud2 import read_points
+from cello3d_ros.clouds.livox import TIME, read_livox
+from cello3d_ros.clouds.point_times import Clock, PointTimesError, TimesOfClouds
+from cello3d_ros.clouds.pointcloud2 import read_fields
 from cello3d_ros.config import Config
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import CloudError
@@ -62,6 +65,7 @@ class Worker:
         self._locator = Locator(node, self._source, self._transforms, extrinsic_is_given)
         self._intake = Intake(self._locator.place, node.odometry_timeout_s, what)
         self._newest_cloud_ns: int | None = None
+        self._times = TimesOfClouds()
         self._tracker = Tracker(model, config, node)
 
     @property
@@ -150,11 +154,10 @@ class Worker:
         received_s = time.monotonic()
         offset_ns = round(1e9 * self.config.node.cloud_time_offset_s)
         stamp_ns = messages.stamp_ns_of(message) + offset_ns
-        points = self._admitted(stamp_ns, message, now_ns)
-        if isinstance(points, Skip):
-            self._skip(points)
+        job = self._admitted(stamp_ns, message, now_ns, received_s)
+        if isinstance(job, Skip):
+            self._skip(job)
             return
-        job = Job(stamp_ns, points, message.header.frame_id, received_s)
         for skip in self._intake.offer(job, n_unheard):
             self._skip(skip)
 
@@ -172,7 +175,10 @@ class Worker:
         """
         assert job.place is not None
         self._began_s = time.monotonic()
-        return self._tracker.step(job.stamp_ns, job.points, job.place)
+        answer = self._tracker.step(job.stamp_ns, job.points, job.place, job.time_s)
+        if answer is not None and job.time_s is None:
+            answer = replace(answer, deskewed=f"no: {job.no_times}")
+        return answer
 
     def finish(self) -> None:
         """Do what the next cloud would have to wait for, once the last one is answered."""
@@ -212,13 +218,14 @@ class Worker:
         for skip in self._intake.clear(reason, f"{event} while it waited"):
             self._skip(skip)
         self._newest_cloud_ns = None
+        self._times = TimesOfClouds()
         self._tracker.reset(event)
 
-    def _admitted(self, stamp_ns: int, message: Any, now_ns: int) -> Array | Skip:
-        """Return the points of a cloud in its turn; a damaged one does not move the clock."""
+    def _admitted(self, stamp_ns: int, message: Any, now_ns: int, received_s: float) -> Job | Skip:
+        """Return a cloud in its turn; a damaged one does not move the clock."""
         try:
             self._check_not_in_future(stamp_ns, now_ns)
-            points = _points(message, MAX_CLOUD_BYTES)
+            points, times = _columns(message, MAX_CLOUD_BYTES, self.config.node.deskew)
         except PoseError as error:
             return Skip(stamp_ns, "future_stamp", str(error))
         except CloudError as error:
@@ -232,7 +239,28 @@ class Worker:
             sentence = f"{order.replace('_', ' ')}: not later than the cloud before"
             return Skip(stamp_ns, order, sentence)
         self._newest_cloud_ns = stamp_ns
-        return points
+        job = Job(stamp_ns, points, message.header.frame_id, received_s)
+        return self._timed(job, times, messages.stamp_ns_of(message))
+
+    def _timed(self, job: Job, times: NDArray[Any] | str, clock_ns: int) -> Job:
+        """Return a cloud with the times of its points, or why it has none.
+
+        times: as the message has them, or why not; clock_ns: its own stamp.  Points whose time is
+        damaged are left out.
+        """
+        if isinstance(times, str):
+            return replace(job, no_times=times)
+        try:
+            time_s = self._times.read(times, clock_ns)
+        except PointTimesError as error:
+            self._warn("times", f"the motion within clouds is not undone: {error}")
+            return replace(job, no_times=str(error))
+        known = np.isfinite(time_s)
+        if not known.any():
+            return replace(job, no_times="no point has a finite time")
+        if known.all():
+            return replace(job, time_s=time_s)
+        return replace(job, points=job.points[known], time_s=time_s[known])
 
     def _check_not_in_future(self, stamp_ns: int, now_ns: int) -> None:
         """Raise PoseError for a stamp after now; a simulated clock at 0 has not started."""
@@ -242,15 +270,30 @@ class Worker:
 
 
 def _points(message: Any, max_bytes: int) -> Array:
-    """Return the points of a PointCloud2, or Livox's CustomMsg, of bounded size.
+    """Return the points (N, 3) of a cloud of bounded size.  Raises CloudError."""
+    return _columns(message, max_bytes, wants_times=False)[0]
 
-    Raises CloudError.
+
+def _columns(message: Any, max_bytes: int, wants_times: bool) -> tuple[Array, NDArray[Any] | str]:
+    """Return points and times of a PointCloud2, or Livox's CustomMsg, of bounded size.
+
+    The times are as the message has them, (N,), or why there are none.  Raises CloudError.
     """
     is_livox = not isinstance(message, PointCloud2)
     n_bytes = _LIVOX_BYTES * len(message.points) if is_livox else len(message.data)
     if n_bytes > max_bytes:
         raise CloudError(f"the cloud holds {n_bytes} bytes, more than {max_bytes}")
-    if not is_livox:
-        return read_points(message)
-    found = read_livox(message)
-    return np.stack([found[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    time = TIME if is_livox else Clock().column(field.name for field in message.fields)
+    if not wants_times:
+        time, why = None, "node.deskew is false"
+    else:
+        why = "the points carry no times"
+    if is_livox:
+        found = read_livox(message)
+    else:
+        try:
+            found = read_fields(message, ("x", "y", "z", *([time] if time else ())))
+        except CloudError as error:
+            found, time, why = read_fields(message, ("x", "y", "z")), None, str(error)
+    points = np.stack([found[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    return points, why if time is None else found[time]

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cello3d_ros.clouds.point_times import UNITS, TimeLaw
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.pose_track import PoseTrack
@@ -85,8 +86,9 @@ class Simulation:
 
     @property
     def times(self) -> str:
-        """Nothing: points have no times."""
-        return ""
+        """That of a scan that sweeps; "" where points have no times."""
+        sweeps = self.drive is not None and self.drive.sweeps
+        return TimeLaw(UNITS["s"]).sentence if sweeps else ""
 
     def __len__(self) -> int:
         return self.n_scans
@@ -128,8 +130,9 @@ class Simulation:
         after_s = 1e-9 * (times - first)
         T_odom_world = built.odometry @ se3.inverse(built.truth)
         drifted = PoseTrack.of_poses(stamps, T_odom_world, np.inf)
-        drift = drifted.motion(first, np.maximum(after_s, 0.0))
-        exact = built.truth[0] @ built.track.motion(first, after_s)
+        ends = float(after_s.min()), float(after_s.max())
+        drift = drifted.motion(first, *ends).at(np.maximum(after_s, 0.0))
+        exact = built.truth[0] @ built.track.motion(first, *ends).at(after_s)
         return PoseTrack.of_poses(times, T_odom_world[0] @ drift @ exact)
 
     def true_track(self) -> PoseTrack:
@@ -194,9 +197,9 @@ def _drifting(truth: Array, drive: Drive | None, rng: np.random.Generator) -> Ar
 
 
 def _at(track: PoseTrack, stamp_ns: int, after_s: Array) -> Array:
-    """Return ``track.motion``, computed once for times that are alike."""
+    """Return ``T(stamp)^-1 T(stamp + after)``, computed once for times that are alike."""
     times, which = np.unique(after_s, return_inverse=True)
-    return track.motion(stamp_ns, times)[which]
+    return track.motion(stamp_ns, float(times[0]), float(times[-1])).at(times)[which]
 
 
 def n_poses(path: Path) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 from cello3d_ros.config import InputConfig
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import to_left
+from cello3d_ros.geometry.motion import Motion
 from cello3d_ros.geometry.pose_track import PoseError, PoseNotYetError
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.geometry.transforms import TransformTree, UnknownFrameError
@@ -39,7 +40,8 @@ class Place:
     T_odom_sensor: (4, 4), None when nobody says it; Y_odom: (6, 6), its right covariance, None
     when odometry gives none.  T_base_sensor: (4, 4).  T_map_odom: (4, 4), where the frame of the
     odometry is in that of the reference cloud; None when only answers can tell.  guess: ODOMETRY,
-    EXTRAPOLATED, CONSTANT_VELOCITY or EXTERNAL.  epoch: as in PoseSource.
+    EXTRAPOLATED, CONSTANT_VELOCITY or EXTERNAL.  epoch: as in PoseSource.  motion: of the sensor
+    while it took the cloud, None when odometry does not tell it.
     """
 
     T_odom_sensor: Array | None
@@ -51,6 +53,7 @@ class Place:
     sensor_frame: str = "lidar"
     epoch: int = 1
     Y_odom: Array | None = None
+    motion: Motion | None = None
 
 
 class Locator:
@@ -74,18 +77,28 @@ class Locator:
         self.warning = ""  # what seems wrong with the frames, in a sentence
         self._extrinsic_is_given = extrinsic_is_given
 
-    def place(self, stamp_ns: int, sensor_frame: str, is_late: bool) -> Place:
+    def place(
+        self,
+        stamp_ns: int,
+        sensor_frame: str,
+        is_late: bool,
+        sweep_s: tuple[float, float] | None = None,
+    ) -> Place:
         """Return where the sensor is at a stamp.
 
-        is_late: the cloud has waited long enough; what comes later is of no use.  Raises
-        PoseNotYetError when waiting may help and PoseMissingError when it will not.
+        sweep_s: when the first and the last point of the cloud were seen, after the stamp; None
+        where nobody asks for the motion meanwhile.  is_late: the cloud has waited long enough;
+        what comes later is of no use.  Raises PoseNotYetError when waiting may help and
+        PoseMissingError when it will not.
         """
         T_odom_base, guess = self._base(stamp_ns, is_late)
         odom_frame = self.source.frame_id or "odom"
         base_frame = self.source.child_frame_id or self.config.base_frame
         self._check_frames(sensor_frame, base_frame, odom_frame)
         T_base_sensor = self._extrinsic(stamp_ns, base_frame, sensor_frame)
-        Y = self.source.covariance(stamp_ns) if guess == ODOMETRY else None
+        is_odometry = guess == ODOMETRY
+        Y = self.source.covariance(stamp_ns) if is_odometry else None
+        motion = self._motion(stamp_ns, sweep_s, is_late) if is_odometry and sweep_s else None
         return Place(
             T_odom_sensor=None if T_odom_base is None else T_odom_base @ T_base_sensor,
             T_base_sensor=T_base_sensor,
@@ -96,7 +109,21 @@ class Locator:
             sensor_frame=sensor_frame,
             epoch=self.source.epoch,
             Y_odom=None if Y is None else to_left(se3.inverse(T_base_sensor), Y),
+            motion=None if motion is None else motion.of_sensor(T_base_sensor),
         )
+
+    def _motion(self, stamp_ns: int, sweep_s: tuple[float, float], is_late: bool) -> Motion | None:
+        """Return the motion of the base during a sweep, None where there is a gap.
+
+        Raises PoseNotYetError when waiting may help.
+        """
+        poses = self.source.poses
+        if poses.covers_sweep(stamp_ns, *sweep_s):
+            return poses.motion(stamp_ns, *sweep_s)
+        end_ns = stamp_ns + int(1e9 * sweep_s[1])
+        if not is_late and poses.newest_ns is not None and poses.newest_ns <= end_ns:
+            raise PoseNotYetError(f"the newest {poses.what} is older than the last point")
+        return None
 
     def _check_frames(self, sensor_frame: str, base_frame: str, odom_frame: str) -> None:
         """Raise FixedFrameError for clouds that are not in a frame of the sensor, or warn."""

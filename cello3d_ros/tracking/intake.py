@@ -6,8 +6,9 @@ import contextlib
 import statistics
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from cello3d_ros.clouds.motion import sweep_of
 from cello3d_ros.geometry.pose_track import PoseError, PoseNotYetError
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.tracking.guess import Place
@@ -36,7 +37,8 @@ class Skip:
 class Job:
     """A cloud on its way: when it came (time.monotonic) and, in the end, where it was taken.
 
-    points: (N, 3), sensor frame.
+    points: (N, 3), sensor frame.  time_s: (N,), finite, when each was seen, after the stamp, or
+    None: then ``no_times`` says why.
     """
 
     stamp_ns: int
@@ -45,6 +47,12 @@ class Job:
     received_s: float
     waited_s: float = 0.0
     place: Place | None = None
+    time_s: Array | None = None
+    no_times: str = ""
+    sweep_s: tuple[float, float] | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.sweep_s = None if self.time_s is None else sweep_of(self.time_s)
 
 
 def stamp_order(stamp_ns: int, newest_ns: int | None) -> str:
@@ -67,7 +75,7 @@ class Intake:
 
     def __init__(
         self,
-        locate: Callable[[int, str, bool], Place],
+        locate: Callable[[int, str, bool, tuple[float, float] | None], Place],
         timeout_s: float,
         what: str = "odometry",
     ) -> None:
@@ -168,7 +176,8 @@ class Intake:
         return skips
 
     def _place(self, job: Job) -> Place:
-        return self._locate(job.stamp_ns, job.frame_id, job.waited_s >= self.timeout_s)
+        is_late = job.waited_s >= self.timeout_s
+        return self._locate(job.stamp_ns, job.frame_id, is_late, job.sweep_s)
 
     def _n_ready(self) -> int:
         """Return how many clouds wait with all that they need."""

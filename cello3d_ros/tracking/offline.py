@@ -6,18 +6,25 @@ none is superseded by a newer one.  Imports no ROS.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+
+from cello3d_ros.clouds.motion import sweep_of
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.errors import Cello3dError, RecordingError
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.pose_track import PoseError, PoseTrack
 from cello3d_ros.recordings.bag import BagRecording
-from cello3d_ros.recordings.recording import Recording, Scan
+from cello3d_ros.recordings.recording import NOT_READ, Recording, Scan
 from cello3d_ros.tracking.guess import CONSTANT_VELOCITY, EXTERNAL, ODOMETRY, Locator, Place
 from cello3d_ros.tracking.odometry import PoseSource
 from cello3d_ros.tracking.tracker import Answer, Tracker
+
+Sweep = tuple[float, float]
 
 
 class Step(NamedTuple):
@@ -31,9 +38,13 @@ class Step(NamedTuple):
 
 def replay(recording: Recording, tracker: Tracker, config: NodeConfig) -> Iterator[Step]:
     """Yield what became of every cloud; the first one's reason is "reference"."""
+    no_times = f"no: {_why_no_times(recording, config)}"
     for scan, place in _places(recording, config):
         if isinstance(place, Place):
-            yield _step(scan, place, tracker)
+            step = _step(scan, place, tracker)
+            if step.answer is not None and scan.time_s is None:
+                step = step._replace(answer=replace(step.answer, deskewed=no_times))
+            yield step
         else:
             sentence = f"no odometry at the stamp of the cloud: {place}"
             yield Step(scan, None, "no_odometry", sentence)
@@ -41,21 +52,46 @@ def replay(recording: Recording, tracker: Tracker, config: NodeConfig) -> Iterat
 
 def _step(scan: Scan, place: Place, tracker: Tracker) -> Step:
     try:
-        answer = tracker.step(scan.stamp_ns, scan.points, place)
+        answer = tracker.step(scan.stamp_ns, scan.points, place, scan.time_s)
     except Cello3dError as error:
         return Step(scan, None, error.reason, str(error))
     return Step(scan, answer, "" if answer is not None else "reference")
 
 
-def _place_of(scan: Scan, has_odometry: bool, config: NodeConfig) -> Place | PoseError:
+def _why_no_times(recording: Recording, config: NodeConfig) -> str:
+    if not config.deskew:
+        return "node.deskew is false"
+    is_unread = recording.times.startswith(NOT_READ)
+    return f"times {recording.times}" if is_unread else "the points carry no times"
+
+
+def _scans(recording: Recording, config: NodeConfig) -> Iterator[tuple[Scan, Sweep | None]]:
+    """Yield each scan and when its first and last point were seen, where that is of use."""
+    for scan in recording:
+        if scan.time_s is None or not config.deskew or not np.isfinite(scan.time_s).any():
+            yield replace(scan, time_s=None), None
+            continue
+        scan = scan.only(np.isfinite(scan.time_s))
+        assert scan.time_s is not None
+        yield scan, sweep_of(scan.time_s)
+
+
+def _place_of(
+    scan: Scan, sweep_s: Sweep | None, odometry: PoseTrack | None, config: NodeConfig
+) -> Place | PoseError:
     """Return the place of a scan by its own pose, or why it has none."""
     guess = EXTERNAL if config.registration == "external" else ODOMETRY
     if scan.T_odom_sensor is None:
-        if has_odometry and config.guess_without_odometry != CONSTANT_VELOCITY:
+        if odometry is not None and config.guess_without_odometry != CONSTANT_VELOCITY:
             return PoseError("the recording has none there")
         guess = CONSTANT_VELOCITY
     X = se3.pose(config.T_base_sensor[:3], config.T_base_sensor[3:])
-    return Place(scan.T_odom_sensor, X, guess=guess)
+    place = Place(scan.T_odom_sensor, X, guess=guess)
+    if sweep_s is None or guess != ODOMETRY or odometry is None:
+        return place
+    if not odometry.covers_sweep(scan.stamp_ns, *sweep_s):
+        return place
+    return replace(place, motion=odometry.motion(scan.stamp_ns, *sweep_s))
 
 
 def _places(recording: Recording, config: NodeConfig) -> Iterator[tuple[Scan, Place | PoseError]]:
@@ -73,17 +109,19 @@ def _places(recording: Recording, config: NodeConfig) -> Iterator[tuple[Scan, Pl
     )
     locator = Locator(config, source)
     if not isinstance(recording, BagRecording) or not recording.has_odometry:
-        for scan in recording:
-            yield scan, _place_of(scan, recording.has_odometry, config)
+        odometry = recording.track() if recording.has_odometry else None
+        for scan, sweep_s in _scans(recording, config):
+            yield scan, _place_of(scan, sweep_s, odometry, config)
         return
     messages = recording.odometry()
-    for scan in recording:
-        while source.poses.newest_ns is None or source.poses.newest_ns < scan.stamp_ns:
+    for scan, sweep_s in _scans(recording, config):
+        end_ns = scan.stamp_ns + (0 if sweep_s is None else math.ceil(1e9 * sweep_s[1]))
+        while source.poses.newest_ns is None or source.poses.newest_ns < end_ns:
             message = next(messages, None)
             if message is None:
                 break
             source.hear(*message, "odom", "", config.max_odometry_speed_m_s)
         try:
-            yield scan, locator.place(scan.stamp_ns, "lidar", is_late=True)
+            yield scan, locator.place(scan.stamp_ns, "lidar", True, sweep_s)
         except PoseError as error:
             yield scan, error

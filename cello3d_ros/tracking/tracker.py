@@ -7,11 +7,12 @@ to in pairing.py; registration and covariance are one call of the estimator.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from cello3d_ros.clouds.motion import undistorted
 from cello3d_ros.clouds.shape import Cloud, filtered
 from cello3d_ros.config import NodeConfig, Pipeline
 from cello3d_ros.covariance.case import MethodSettings
@@ -19,6 +20,7 @@ from cello3d_ros.covariance.estimator import Estimate, Estimator, draws, needs_s
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import ModelError, RegistrationError
 from cello3d_ros.geometry.gaussian import GaussianPose, extended, to_left
+from cello3d_ros.geometry.motion import Motion
 from cello3d_ros.geometry.se3 import Array, inverse, log
 from cello3d_ros.geometry.transforms import seen_from_base
 from cello3d_ros.tracking.agreement import (
@@ -35,6 +37,7 @@ from cello3d_ros.tracking.pairing import PAIRINGS, ToMap
 from cello3d_ros.tracking.planar import on_the_floor
 
 _ORIGIN = np.eye(4)
+NO_TIMES = "no: the points carry no times"
 _N_THREADS = min(os.cpu_count() or 1, 4)  # more than that is not worth starting
 
 
@@ -60,6 +63,7 @@ class Answer:
     where it was at the scan answered before, span_s earlier; both None where that is unknown.
     guess: where the first guess came from.  offset: (6,), the twist by which ICP would move an
     external pose, else None.  disagreement: why odometry contradicts it, in a sentence, or "".
+    deskewed: by what the motion within the reading was undone, or "no: " and why it was not.
     """
 
     stamp_ns: int
@@ -75,6 +79,7 @@ class Answer:
     guess: str = ODOMETRY
     offset: Array | None = None
     disagreement: str = ""
+    deskewed: str = NO_TIMES
 
 
 class _Found(NamedTuple):
@@ -126,18 +131,24 @@ class Tracker:
         ):
             self.reset("the frame of the reference cloud changed")
 
-    def step(self, stamp_ns: int, points: Array, place: Place) -> Answer | None:
+    def step(
+        self, stamp_ns: int, points: Array, place: Place, time_s: Array | None = None
+    ) -> Answer | None:
         """Register a scan to its reference; it becomes the next one, or not, by ``pairing``.
 
-        points: (N, 3), sensor frame.  Returns None for a scan that only starts a chain.
-        Raises CloudError, RegistrationError or ModelError (the pair is beyond the model) when
-        there is no answer: the reference stays, until ``max_failures`` scans in a row have failed
-        against it; then the chain starts again at the last of them.  It starts again at once
-        where nothing has fitted the first scan of a chain and two scans after it fit each other.
+        points: (N, 3), sensor frame.  time_s: (N,), finite, when each was seen, after the stamp,
+        or None: by them the motion within the scan is undone.  Returns None for a scan that only
+        starts a chain.  Raises CloudError, RegistrationError or ModelError (the pair is beyond
+        the model) when there is no answer: the reference stays, until ``max_failures`` scans in a
+        row have failed against it; then the chain starts again at the last of them.  It starts
+        again at once where nothing has fitted the first scan of a chain and two scans after it
+        fit each other.
         """
+        sweep = None if time_s is None or place.motion is not None else (points, time_s)
+        points, deskewed = self._deskewed(stamp_ns, points, place, time_s)
         rng = draws(points, self.config.seed)
         cloud = filtered(points, self.pipeline.cloud, rng, _N_THREADS)
-        frame = self._in_chain(Frame(stamp_ns, cloud, place, place.T_odom_sensor))
+        frame = self._in_chain(Frame(stamp_ns, cloud, place, place.T_odom_sensor, sweep))
         reference = self._pairing.reference(frame, self._chain, self.config, self.pipeline.cloud)
         if reference is None:
             self._begin(Link.first(frame, _ORIGIN))
@@ -156,7 +167,7 @@ class Tracker:
         pose = extended(reference.pose, found.step)
         found = self._with_motion(frame, found, reference)
         self._accept(frame, found, reference, pose)
-        return self._published(frame, found, reference, pose)
+        return replace(self._published(frame, found, reference, pose), deskewed=deskewed)
 
     def finish(self) -> None:
         """Work ahead: find the local shape of the reference, which the next scan will need.
@@ -165,6 +176,26 @@ class Tracker:
         """
         if (frame := self._pairing.next_reference) is not None:
             frame.shaped(self.pipeline.cloud, _N_THREADS)
+
+    def _deskewed(
+        self, stamp_ns: int, points: Array, place: Place, time_s: Array | None
+    ) -> tuple[Array, str]:
+        """Return points as seen at the stamp, and what told the motion or why it is not undone.
+
+        Odometry tells it, else the last registration: its velocity goes on.  The reference is
+        undone by the same velocity, so that an error of it is common to both.
+        """
+        if time_s is None:
+            return points, NO_TIMES
+        if place.motion is not None:
+            return undistorted(points, time_s, place.motion), "by odometry"
+        newest, velocity = self._chain.newest, self._chain.velocity
+        if newest is None or velocity is None:
+            return points, "no: nothing tells the motion yet"
+        if 1e-9 * (stamp_ns - newest.frame.stamp_ns) > self.config.max_pair_gap_s:
+            return points, "no: the last registration is too old to tell the motion"
+        motion = Motion.constant(velocity)
+        return undistorted(points, time_s, motion), "by the last registration"
 
     def _in_chain(self, frame: Frame) -> Frame:
         """Return a scan that can follow the one before; else start the chain at it and raise.
@@ -277,6 +308,8 @@ class Tracker:
             frame = frame.at(T_odom_ref @ found.step.T)
         link = Link(frame, pose)
         self._chain.add(link)
+        for scan in (frame, reference.frame):  # the first of a chain has not been undone yet
+            scan.velocity = self._chain.velocity
         self._pairing.accept(link, found.estimate, self.config)
         self._rival, self.n_failures = None, 0
 

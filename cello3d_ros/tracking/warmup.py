@@ -10,6 +10,7 @@ import numpy as np
 from cello3d_ros.config import Config
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import Cello3dError
+from cello3d_ros.geometry.motion import Motion
 from cello3d_ros.geometry.se3 import Array, exp, inverse, transform
 from cello3d_ros.tracking.guess import Place
 from cello3d_ros.tracking.tracker import Tracker
@@ -30,7 +31,9 @@ def warm_up(model: Model, config: Config) -> None:
     points = room(rng)
     for stamp_ns, T in enumerate((np.eye(4), step)):
         with contextlib.suppress(Cello3dError):
-            tracker.step(stamp_ns, transform(inverse(T), points), Place(T))
+            place = Place(T, motion=Motion.constant(np.zeros(6)))
+            seen = transform(inverse(T), points)
+            tracker.step(stamp_ns, seen, place, time_s=np.zeros(len(points)))
 
 
 def _box(rng: np.random.Generator, n_points: int, size: Array) -> Array:

@@ -12,6 +12,7 @@ from cello3d_ros.clouds.point_times import (
     UNITS,
     Clock,
     PointTimesError,
+    TimesOfClouds,
     law_of,
     recognise,
     relative_s,
@@ -284,3 +285,29 @@ def test_the_stamps_of_clouds_can_be_moved_to_the_clock_of_the_poses(tmp_path: P
         if k < 3:
             assert np.allclose(scan.T_odom_sensor[:3, :3], se3.exp((0.1 * k + 0.05) * xi)[:3, :3])
     assert scan.T_odom_sensor is None
+
+
+@pytest.mark.parametrize(("factor", "kind"), [(1.0, "f8"), (1e6, "u4"), (1e9, "u4")])
+def test_times_of_clouds_that_come_one_by_one_are_read_from_the_first_on(factor, kind) -> None:
+    reader = TimesOfClouds()
+    for k in range(15):
+        values = (factor * TIMES).astype(kind)
+        np.testing.assert_allclose(
+            reader.read(values, STAMP + k * 10**8), np.asarray(TIMES), atol=1e-6
+        )
+
+
+def test_milliseconds_are_told_from_seconds_once_two_clouds_have_come() -> None:
+    reader, values = TimesOfClouds(), (1e3 * TIMES).astype("f4")
+    with pytest.raises(PointTimesError):
+        reader.read(values, STAMP)
+    np.testing.assert_allclose(reader.read(values, STAMP + 10**8), TIMES, atol=1e-6)
+
+
+def test_times_that_cannot_be_right_are_refused_each_time_and_another_type_begins_anew() -> None:
+    reader = TimesOfClouds()
+    for k in range(12):
+        with pytest.raises(PointTimesError, match="no scan in any unit"):
+            reader.read(1e8 * TIMES, STAMP + k * 10**8)
+    found = reader.read((1e9 * TIMES).astype("u4"), STAMP + 12 * 10**8)
+    np.testing.assert_allclose(found, TIMES, atol=1e-6)
