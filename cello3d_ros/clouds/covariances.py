@@ -44,6 +44,9 @@ def covariances(
     guess2 = most2 = LEAST2  # the last threshold; the greatest of the last leaf
     for g in range(first, stop):
         size = min(WIDTH, n - WIDTH * g)
+        if not wanted[WIDTH * g : WIDTH * g + size].any():  # the guesses wait for the next leaf
+            out[g - first] = 0.0
+            continue
         for a in range(3):
             box[a], box[3 + a] = np.inf, -np.inf
             for lane in range(size):

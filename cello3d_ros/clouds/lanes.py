@@ -34,14 +34,6 @@ def _lowest_bit(_: Any, mask: Any) -> Any:
     return _I8(mask), codegen
 
 
-def _points_near(_: Any, points: Any, leaf: Any, x: Any, y: Any, z: Any, far2: Any) -> Any:
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = data_of(context, builder, signature, arguments, 0)
-        return _mask(builder, _from_points(builder, data, *arguments[1:5]), arguments[5])
-
-    return _I8(points, _I8, _F8, _F8, _F8, _F8), codegen
-
-
 def _distances_of(
     _: Any, points: Any, leaf: Any, x: Any, y: Any, z: Any, most2: Any, rows: Any, row: Any
 ) -> Any:
@@ -182,8 +174,6 @@ def _mask(builder: Any, values: Any, most: Any) -> Any:
 
 # lowest_bit(mask): the number of the lowest bit that is set
 lowest_bit: Any = intrinsic(_lowest_bit)
-# points_near(points, leaf, x, y, z, far2): a mask of the points at most far2 away, squared
-points_near: Any = intrinsic(_points_near)
 # distances_of(points, leaf, x, y, z, most2, rows, row): fill a row with the points' squared
 # distances, rounded alike; return how many are at most most2
 distances_of: Any = intrinsic(_distances_of)

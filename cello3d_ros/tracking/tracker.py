@@ -118,7 +118,8 @@ class Tracker:
         if self._chain.newest is not None:
             self.n_restarts += 1
             self.last_restart = reason
-        self._chain, self._rival, self.n_failures = Chain(), None, 0
+        self._chain, self._before, self._rival = Chain(), None, None
+        self.n_failures = 0
         self._pairing.begin(None)
 
     def take_map(self, stamp_ns: int, points: Array, frame_id: str) -> None:
