@@ -163,6 +163,12 @@ class TrainingConfig(Section):
         "what Theta is learned over; descriptor is the paper's, global a few numbers of the pair",
         choices=("descriptor", "global", "both"),
     )
+    standardize: bool = _setting(
+        True, "scale each input to mean 0 and deviation 1; the paper takes them as they are"
+    )
+    start_rho: float = _setting(
+        1.0, "median rho of the Theta that training starts from; near 0 all weights are equal", 0.0
+    )
     theta: str = _setting(
         "diagonal", "form of Theta", choices=("upper_triangular", "diagonal", "low_rank")
     )

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from cello3d_ros.errors import Cello3dError
 
 if TYPE_CHECKING:
-    from cello3d_ros.reproduction.datasets import Recordings, Workshop
+    from cello3d_ros.reproduction.datasets import Workshop
     from cello3d_ros.reproduction.result import Result
 
 #: Registrations of each by default; the paper has 5000 everywhere.
@@ -47,15 +47,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "a figure needs",
     )
     parser.add_argument(
-        "--scans", type=_positive, default=8, metavar="N", help="of a sampled simulation (8)"
+        "--scans", type=_positive, metavar="N", help="of each simulation, by default all"
     )
     parser.add_argument(
-        "--walk", type=_positive, default=25, metavar="N", help="scans of simulated odometry (25)"
+        "--places",
+        type=_positive,
+        default=1,
+        metavar="N",
+        help="simulated places of each kind, of successive seeds (1)",
     )
     parser.add_argument(
-        "--runs", type=_positive, default=100, metavar="N", help="odometries of a sequence (100)"
+        "--runs", type=_positive, default=100, metavar="N", help="odometries of a recording (100)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of every random draw")
+    parser.add_argument("--seed", type=int, default=0, help="of places and random draws (0)")
     parser.add_argument(
         "--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N", help="threads"
     )
@@ -81,8 +85,10 @@ def run(arguments: argparse.Namespace) -> None:
     """Make what was asked for, each published as soon as it is done."""
     if arguments.seed < 0:
         raise Cello3dError(f"--seed must not be negative: {arguments.seed}")
-    if arguments.walk < 2:
-        raise Cello3dError("--walk must be at least 2: odometry needs two scans")
+    if arguments.scans == 1:
+        raise Cello3dError("--scans must be at least 2: odometry needs two scans")
+    if arguments.data and arguments.places > 1:
+        raise Cello3dError("--places is for simulated places, --data has one of each kind")
     wanted = list(_N_SAMPLES) if arguments.what == "all" else [arguments.what]
     if arguments.data and not set(wanted) & set(_ON_RECORDINGS):
         raise Cello3dError(f"--data is for {', '.join(_ON_RECORDINGS)}, not {arguments.what}")
@@ -117,21 +123,27 @@ def _make(what: str, arguments: argparse.Namespace) -> None:
 
 def _on_recordings(what: str, workshop: Workshop, arguments: argparse.Namespace) -> Result:
     """Make a table or figure of recordings, the paper's or simulated ones."""
-    from cello3d_ros.reproduction import datasets, table1, table2, trajectories
+    from dataclasses import replace
 
-    training: Recordings
+    from cello3d_ros.reproduction import datasets, table1, table2, trajectories
+    from cello3d_ros.reproduction.models import Place
+
     if arguments.data:
-        training = walks = datasets.recorded(arguments.data)
+        places = [Place(workshop, datasets.recorded(arguments.data))]
         source = "on the paper's own data"
     else:
-        training, walks = datasets.simulated(arguments.scans), datasets.simulated(arguments.walk)
-        source = "on simulated counterparts, two recordings of each"
+        seeds = range(arguments.seed, arguments.seed + arguments.places)
+        places = [
+            Place(replace(workshop, seed=seed), datasets.simulated(seed, arguments.scans))
+            for seed in seeds
+        ]
+        source = "on simulated counterparts"
     if what == "table1":
-        result = table1.make(workshop, training, source)
+        result = table1.make(places, source)
     elif what == "table2":
-        result = table2.make(workshop, training, walks, arguments.runs, source)
+        result = table2.make(places, arguments.runs, source)
     else:
-        result = trajectories.make(workshop, training, walks)
+        result = trajectories.make(places[0])
     if arguments.data:
         return result._replace(
             what=f"{what}-recorded", title=f"{result.title}, on the paper's data"
@@ -156,7 +168,7 @@ def _command(what: str, arguments: argparse.Namespace) -> str:
     flags: dict[str, object] = {}
     if arguments.samples is not None:
         flags["--samples"] = arguments.samples
-    for name, default in (("scans", 8), ("walk", 25), ("runs", 100), ("seed", 0)):
+    for name, default in (("scans", None), ("places", 1), ("runs", 100), ("seed", 0)):
         if (value := getattr(arguments, name)) != default:
             flags[f"--{name}"] = value
     if arguments.data:

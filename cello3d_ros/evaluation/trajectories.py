@@ -67,9 +67,24 @@ def odometry_runs(
     ``T_mean exp(xi)``, xi ~ N(0, model.sampling.variance I), draws its own subsamples and has its
     own covariance predicted.  A run does not depend on the others or on the threads.
     """
+    return runs_of_models(clouds, T_world_sensor, [model], n_runs, seed, n_threads)[0]
 
-    def one(run: int) -> _Run | None:
-        return _run(clouds, T_world_sensor, model, np.random.default_rng([seed, run]))
+
+def runs_of_models(
+    clouds: Sequence[Cloud],
+    T_world_sensor: Array,
+    models: Sequence[Model],
+    n_runs: int,
+    seed: int = 0,
+    n_threads: int = 1,
+) -> list[Runs]:
+    """Return the same runs judged by each of some models that have one pipeline.
+
+    Starts scatter as in the sampling of the first.
+    """
+
+    def one(run: int) -> list[_Run] | None:
+        return _run(clouds, T_world_sensor, models, np.random.default_rng([seed, run]))
 
     if n_threads <= 1:
         runs = [one(run) for run in range(n_runs)]
@@ -78,11 +93,18 @@ def odometry_runs(
             runs = list(pool.map(one, range(n_runs)))
     reached = [run for run in runs if run is not None]
     T_true = inverse(T_world_sensor[0]) @ T_world_sensor[-1]
-    xi = log(inverse(T_true) @ np.array([run.path[-1].T for run in reached]).reshape(-1, 4, 4))
-    Y = np.array([run.path[-1].Y for run in reached]).reshape(-1, 6, 6)
-    lost = np.array([run.is_lost for run in reached], np.bool_)
-    told = np.array([run.is_told for run in reached], np.bool_)
-    return Runs(xi, Y, lost, told, n_runs - len(reached), tuple(run.path for run in reached))
+    return [
+        _stacked([run[k] for run in reached], T_true, n_runs - len(reached))
+        for k in range(len(models))
+    ]
+
+
+def _stacked(runs: Sequence[_Run], T_true: Array, n_failed: int) -> Runs:
+    xi = log(inverse(T_true) @ np.array([run.path[-1].T for run in runs]).reshape(-1, 4, 4))
+    Y = np.array([run.path[-1].Y for run in runs]).reshape(-1, 6, 6)
+    lost = np.array([run.is_lost for run in runs], np.bool_)
+    told = np.array([run.is_told for run in runs], np.bool_)
+    return Runs(xi, Y, lost, told, n_failed, tuple(run.path for run in runs))
 
 
 def compound_chain(steps: Sequence[GaussianPose]) -> GaussianPose:
@@ -156,22 +178,33 @@ def length_m(T_world_sensor: Array) -> float:
 
 
 def _run(
-    clouds: Sequence[Cloud], T_world_sensor: Array, model: Model, rng: np.random.Generator
-) -> _Run | None:
-    """Return one odometry; None without an answer."""
-    sampling = model.sampling
-    estimator = Estimator(model, settings=DEFAULTS._replace(widen_unknown=False))
-    steps, is_lost, is_told = [], False, False
+    clouds: Sequence[Cloud],
+    T_world_sensor: Array,
+    models: Sequence[Model],
+    rng: np.random.Generator,
+) -> list[_Run] | None:
+    """Return one odometry by each model; None without an answer."""
+    sampling = models[0].sampling
+    settings = DEFAULTS._replace(widen_unknown=False)
+    estimators = [Estimator(model, settings=settings) for model in models]
+    steps: list[list[GaussianPose]] = [[] for _ in models]
+    is_told = [False] * len(models)
+    is_lost = False
     for k in range(1, len(clouds)):
+        pair = clouds[k], clouds[k - 1]
         T_mean = inverse(T_world_sensor[k - 1]) @ T_world_sensor[k]
         T_init = T_mean @ exp(rng.normal(scale=np.sqrt(sampling.variance), size=6))
         try:
-            step = estimator.register(clouds[k], clouds[k - 1], T_init, rng)
+            answers = [estimators[0].register(*pair, T_init, rng)]
+            found = answers[0].registration
+            answers += [other.judge(*pair, found, rng) for other in estimators[1:]]
         except RegistrationError:
             return None
-        T_hat = step.registration.T_ref_read
-        steps.append(GaussianPose(T_hat, step.covariance))
-        xi = log(inverse(T_mean) @ T_hat)
+        for m, answer in enumerate(answers):
+            steps[m].append(GaussianPose(found.T_ref_read, answer.covariance))
+            is_told[m] |= answer.is_lost
+        xi = log(inverse(T_mean) @ found.T_ref_read)
         is_lost |= bool(far_from_truth(xi, sampling.cluster_scale_m, sampling.cluster_scale_rad))
-        is_told |= step.is_lost
-    return _Run(compound_path(steps), is_lost, is_told)
+    return [
+        _Run(compound_path(path), is_lost, told) for path, told in zip(steps, is_told, strict=True)
+    ]

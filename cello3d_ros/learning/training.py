@@ -88,6 +88,8 @@ def fit(
         validation = select_inputs(validation, config.features)
     _check_groups(examples, validation)
     mean, scale, active = feature_scaler(examples)
+    if not config.standardize:
+        mean, scale = np.zeros_like(mean), np.ones_like(scale)
     problem = leave_out_problem(examples, config, mean, scale)
     judge = problem
     if validation is not None:
@@ -243,7 +245,7 @@ class _Search:
             self._step(free)
 
     def _start(self) -> Array:
-        """Return the free numbers of a Theta under which the median rho is 1."""
+        """Return the free numbers of a Theta under which the median rho is ``start_rho``."""
         n = self._n_features
         if self._config.theta == "diagonal":
             free = np.ones(n)
@@ -253,7 +255,7 @@ class _Search:
             rank = min(self._config.rank, n)
             free = np.random.default_rng(self._config.seed).normal(size=rank * n)
         rho = median_rho(self._problem, self._matrix(free))
-        return free / np.sqrt(rho) if rho > 0 else free
+        return free * np.sqrt(self._config.start_rho / rho) if rho > 0 else free
 
     def _matrix(self, free: Array) -> Array:
         n = self._n_features

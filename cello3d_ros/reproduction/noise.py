@@ -13,11 +13,9 @@ from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.sampling import sample_recording
 from cello3d_ros.reproduction import drawing
-from cello3d_ros.reproduction.datasets import SCANNER
 from cello3d_ros.reproduction.result import Result, markdown_table
 from cello3d_ros.reproduction.scenes import censi_of, cube, errors
-from cello3d_ros.simulation.products import SCANNERS
-from cello3d_ros.simulation.simulation import Simulation
+from cello3d_ros.reproduction.sequences import counterpart
 
 SIGMAS_M = (0.001, 0.002, 0.005, 0.01, 0.02, 0.03, 0.05)
 _N_POINTS = 1000
@@ -60,8 +58,8 @@ def _cube(sigma_m: float, n_samples: int, n_threads: int, seed: int) -> tuple[Ar
 
 def _apartment(sigma_m: float, n_samples: int, n_threads: int, seed: int) -> tuple[Array, Array]:
     pipeline = Pipeline()
-    scanner = replace(SCANNERS[SCANNER], range_noise_m=sigma_m)
-    recording = Simulation("rooms", 100, 2, scanner)
+    recording = counterpart("apartment", 0, 2)
+    recording = replace(recording, scanner=replace(recording.scanner, range_noise_m=sigma_m))
     sampling = SamplingConfig(n_samples=n_samples, seed=seed)
     (record,) = sample_recording(recording, [(0, 1)], pipeline, sampling, n_threads)
     clouds, _ = prepared(recording, pipeline, [0, 1], seed)

@@ -2,8 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple
+
+from cello3d_ros.simulation.paths import Course
+from cello3d_ros.simulation.products import SCANNERS
+from cello3d_ros.simulation.simulation import Simulation
+
+# the paper's scanner, at the density of its clouds: 360 000 points in the apartment, 190 000 in
+# the hall and on the stairs, 160 000 to 220 000 outside, where the sky returns nothing
+_FINE = replace(SCANNERS["tilting_hokuyo"], n_beams=344, azimuth_step_deg=0.25)
+_COARSE = replace(_FINE, n_beams=182)
+_FIRST_SEED = 100  # of the places
 
 
 class PaperTrajectory(NamedTuple):
@@ -20,16 +31,16 @@ class PaperTrajectory(NamedTuple):
 class Sequence(NamedTuple):
     """One sequence.
 
-    world, seeds: two simulated recordings of the same kind.  The two seasons of a kind have
-    different seeds, so that a model is tested on places that it has not seen; the paper's seasons
-    were of one place.  folder: the name of the sequence in the 'Challenging data sets'.
-    trained_on: keys of the sequences that the paper trained on.  kl_baseline, kl_ours, kl_censi:
-    its Table I; trajectory: its Table II.
+    world, n_scans: of its simulated counterpart, as many scans as the paper had.  second: whether
+    it is the second season of a place, walked another way.  folder: the name of the sequence in
+    the 'Challenging data sets'.  trained_on: keys of the sequences that the paper trained on.
+    kl_baseline, kl_ours, kl_censi: its Table I; trajectory: its Table II.
     """
 
     title: str
     world: str
-    seeds: tuple[int, int]
+    n_scans: int
+    second: bool
     folder: str
     trained_on: tuple[str, ...]
     kl_baseline: float
@@ -43,7 +54,8 @@ SEQUENCES: MappingProxyType[str, Sequence] = MappingProxyType(
         "apartment": Sequence(
             "Apartment",
             "rooms",
-            (100, 101),
+            45,
+            False,
             "Apartment",
             ("hauptgebaude", "stairs"),
             34.1,
@@ -54,7 +66,8 @@ SEQUENCES: MappingProxyType[str, Sequence] = MappingProxyType(
         "hauptgebaude": Sequence(
             "Hauptgebaude",
             "hall",
-            (100, 101),
+            36,
+            False,
             "ETH Hauptgebaude",
             ("apartment", "stairs"),
             34.0,
@@ -65,7 +78,8 @@ SEQUENCES: MappingProxyType[str, Sequence] = MappingProxyType(
         "stairs": Sequence(
             "Stairs",
             "stairs",
-            (100, 101),
+            31,
+            False,
             "Stairs",
             ("apartment", "hauptgebaude"),
             33.7,
@@ -76,7 +90,8 @@ SEQUENCES: MappingProxyType[str, Sequence] = MappingProxyType(
         "gazebo_summer": Sequence(
             "Gazebo Summer",
             "garden",
-            (100, 101),
+            32,
+            False,
             "Gazebo in summer",
             ("gazebo_winter",),
             20.8,
@@ -87,7 +102,8 @@ SEQUENCES: MappingProxyType[str, Sequence] = MappingProxyType(
         "gazebo_winter": Sequence(
             "Gazebo Winter",
             "garden_winter",
-            (102, 103),
+            31,
+            True,
             "Gazebo in winter",
             ("gazebo_summer",),
             20.3,
@@ -98,7 +114,8 @@ SEQUENCES: MappingProxyType[str, Sequence] = MappingProxyType(
         "wood_autumn": Sequence(
             "Wood Autumn",
             "wood_autumn",
-            (102, 103),
+            32,
+            True,
             "Wood in autumn",
             ("wood_summer",),
             13.2,
@@ -109,7 +126,8 @@ SEQUENCES: MappingProxyType[str, Sequence] = MappingProxyType(
         "wood_summer": Sequence(
             "Wood Summer",
             "wood",
-            (100, 101),
+            37,
+            False,
             "Wood in summer",
             ("wood_autumn",),
             13.6,
@@ -119,3 +137,21 @@ SEQUENCES: MappingProxyType[str, Sequence] = MappingProxyType(
         ),
     }
 )
+
+
+def counterpart(key: str, seed: int, n_scans: int | None = None) -> Simulation:
+    """Return the simulated counterpart of a sequence, or its first scans.
+
+    It has the length of the paper's sequence.  A seed is a place of the kind, the same in both
+    seasons, which are walked by other steps, starting elsewhere, aside of each other.
+    """
+    sequence = SEQUENCES[key]
+    step_m = sequence.trajectory.length_m / (sequence.n_scans - 1)
+    return Simulation(
+        sequence.world,
+        _FIRST_SEED + seed,
+        min(n_scans or sequence.n_scans, sequence.n_scans),
+        _COARSE if key in ("hauptgebaude", "stairs") else _FINE,
+        title=f"{key}-{seed}",
+        course=Course(step_m, 1.5, 0.3, 1) if sequence.second else Course(step_m),
+    )

@@ -8,13 +8,12 @@ import numpy as np
 
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.evaluation.online import prepared
-from cello3d_ros.evaluation.trajectories import Runs, compound_path, odometry_runs
+from cello3d_ros.evaluation.trajectories import compound_path, runs_of_models
 from cello3d_ros.geometry.gaussian import GaussianPose, to_fixed_axes
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.learning.dataset import Dataset
 from cello3d_ros.reproduction import drawing
-from cello3d_ros.reproduction.datasets import Recordings, Workshop, sampled
-from cello3d_ros.reproduction.models import datasets, testable, trained
+from cello3d_ros.reproduction.models import MODELS, TRAINED, Place, datasets, testable, trained
 from cello3d_ros.reproduction.result import Result
 from cello3d_ros.reproduction.sequences import SEQUENCES
 
@@ -37,15 +36,14 @@ class _Walk(NamedTuple):
     n_lost: int
 
 
-def make(workshop: Workshop, training: Recordings, walks: Recordings) -> Result:
+def make(place: Place) -> Result:
     """Draw 20 runs of each sequence with the ellipses of three covariances."""
-    keys = [key for key in SHOWN if key in testable(training)]
+    keys = [key for key in SHOWN if key in testable(place.recordings)]
     if not keys:
         titles = " and ".join(SEQUENCES[key].title for key in SHOWN)
         raise DatasetError(f"the figure needs {titles}, one at least, and the other season")
-    needed = {k: training[k] for key in keys for k in SEQUENCES[key].trained_on}
-    found = datasets(workshop, needed)
-    shown = {key: _walk(workshop, found, walks, key) for key in keys}
+    found = datasets(place, {k for key in keys for k in (key, *SEQUENCES[key].trained_on)})
+    shown = {key: _walk(place, found, key) for key in keys}
     inside = {
         key: {name: _share_inside(walk, path[-1]) for name, path in walk.paths.items()}
         for key, walk in shown.items()
@@ -94,32 +92,30 @@ def _sentence(key: str, walk: _Walk, inside: dict[str, float]) -> str:
     )
 
 
-def _walk(workshop: Workshop, found: dict[str, Dataset], walks: Recordings, key: str) -> _Walk:
-    models, _ = trained(workshop, found, key, ("paper", "relative"))
-    recording = walks[key][0]
-    chain = sampled(workshop, f"{key}_chain", [recording], max_gap=1)
+def _walk(place: Place, found: dict[str, Dataset], key: str) -> _Walk:
+    configs = {name: MODELS[name] for name in TRAINED}
+    models, _ = trained(place, found, key, configs)
+    recording, workshop, dataset = place.recordings[key], place.workshop, found[key]
     scans = range(len(recording))
-    records = [chain.read(recording.name, k - 1, k) for k in scans[1:]]
+    records = [dataset.read(recording.name, k - 1, k) for k in scans[1:]]
     if bad := [record for record in records if not record.accepted]:
-        raise DatasetError(f"{chain.path}: pair {bad[0].key} was rejected ({bad[0].reason})")
-    clouds, poses = prepared(recording, chain.pipeline, scans, workshop.seed)
+        raise DatasetError(f"{dataset.path}: pair {bad[0].key} was rejected ({bad[0].reason})")
+    clouds, poses = prepared(recording, dataset.pipeline, scans, workshop.seed)
     T = np.array([poses[k] for k in scans])
     truth = inverse(T[0]) @ T
     paths = {"sampled": compound_path([GaussianPose(r.T_mean, r.covariance) for r in records])}
-
-    def odometry(name: str, n: int) -> Runs:
-        some = [clouds[k] for k in scans]
-        return odometry_runs(some, T, models[name], n, workshop.seed, workshop.n_threads)
-
-    runs = odometry("relative", _N_RUNS)
-    found_way = np.flatnonzero(~runs.lost)
+    every = runs_of_models(
+        *([clouds[k] for k in scans], T, list(models.values()), _N_RUNS),
+        *(workshop.seed, workshop.n_threads),
+    )
+    runs = every[0]
     if not runs.paths:
         raise DatasetError(f"{recording.name}: no run of odometry has an answer")
+    found_way = np.flatnonzero(~runs.lost)
     if not len(found_way):
         found_way = np.arange(len(runs.paths))
-    first = int(found_way[0])  # the same registrations for either model
-    paths["paper"] = odometry("paper", first + 1 + runs.n_failed).paths[first]
-    paths["relative"] = runs.paths[first]
+    first = int(found_way[0])
+    paths |= {name: of_model.paths[first] for name, of_model in zip(models, every, strict=True)}
     drawn = [runs.paths[k] for k in found_way[:_N_DRAWN]]
     return _Walk(truth, paths, drawn, int(runs.lost.sum()))
 

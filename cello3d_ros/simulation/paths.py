@@ -91,17 +91,40 @@ def smooth(corners: ArrayLike, closed: bool, spacing_m: float = 0.05) -> Route:
     return Route(np.stack([np.interp(even, s, c) for c in points.T], axis=1), closed)
 
 
-def walk(route: Route, n_scans: int, height_m: float, rng: np.random.Generator) -> Array:
+@dataclass(frozen=True)
+class Course:
+    """One of the ways to walk along a route.
+
+    step_m: mean length of a step, each within a fifth of it.  start_m: arc length of the first
+    scan.  aside_m: distance to the left of the route.  seed: of steps, sway and height.
+    """
+
+    step_m: float
+    start_m: float = 0.0
+    aside_m: float = 0.0
+    seed: int = 0
+
+
+def walk(
+    route: Route,
+    n_scans: int,
+    height_m: float,
+    rng: np.random.Generator,
+    course: Course | None = None,
+) -> Array:
     """Return sensor poses T_world_sensor (n_scans, 4, 4) along the route.
 
-    Steps of 0.4 to 0.9 m, of at least 0.3 m where the curve turns.  The sensor looks along the
-    curve, turning by at most 12 degrees a step, and sways in roll, pitch, yaw and height.  A
-    longer walk starts like a shorter one of the same generator.
+    Without a course steps are 0.4 to 0.9 m long, and at least 0.3 m where the curve turns.  The
+    sensor looks along the curve, turning by at most 12 degrees a step, and sways in roll, pitch,
+    yaw and height.  A longer walk starts like a shorter one of the same generator.
     """
     step_rng, sway_rng = rng.spawn(2)
     s = _arc_length(route.points)
-    at, yaw = _steps(route, s, n_scans, step_rng)
-    place = np.stack([np.interp(at, s, c) for c in route.points.T], axis=1)
+    if course is None:
+        at, yaw = _steps(route, s, n_scans, step_rng)
+        place = np.stack([np.interp(at, s, c) for c in route.points.T], axis=1)
+    else:
+        place, yaw = _on_course(route, course, n_scans, step_rng)
     sway = _sway(n_scans, sway_rng)
     T = np.tile(np.eye(4), (n_scans, 1, 1))
     angles = np.stack([yaw + sway[:, 2], sway[:, 1], sway[:, 0]], axis=1)
@@ -125,6 +148,23 @@ def _steps(route: Route, s: Array, n_scans: int, rng: np.random.Generator) -> tu
         at.append(walked % length if route.closed else fro)
         yaw.append(yaw[-1] + np.clip(turn, -_MAX_TURN_RAD, _MAX_TURN_RAD))
     return np.array(at), np.array(yaw)
+
+
+def _on_course(
+    route: Route, course: Course, n_scans: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return the place (n, 3) and the yaw (n,) of each scan of a walk on a course."""
+    steps = course.step_m * rng.uniform(0.8, 1.2, size=n_scans - 1)
+    s = course.start_m + np.concatenate([[0.0], np.cumsum(steps)])
+    if not route.closed:
+        s = route.arc_m[-1] - np.abs(s % (2 * route.arc_m[-1]) - route.arc_m[-1])
+    place, heading = route.at(s)
+    yaw = [heading[0]]
+    for wanted in heading[1:]:
+        turn = (wanted - yaw[-1] + np.pi) % (2 * np.pi) - np.pi
+        yaw.append(yaw[-1] + np.clip(turn, -_MAX_TURN_RAD, _MAX_TURN_RAD))
+    left = np.stack([-np.sin(heading), np.cos(heading), np.zeros(n_scans)], axis=1)
+    return place + course.aside_m * left, np.array(yaw)
 
 
 def _sway(n_scans: int, rng: np.random.Generator) -> Array:

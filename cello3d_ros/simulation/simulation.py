@@ -20,7 +20,7 @@ from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.recordings.tables import read_bytes
 from cello3d_ros.simulation.casting import Surroundings, cast
 from cello3d_ros.simulation.drives import Drive, body, trajectory
-from cello3d_ros.simulation.paths import Route, walk
+from cello3d_ros.simulation.paths import Course, Route, walk
 from cello3d_ros.simulation.products import SCANNERS
 from cello3d_ros.simulation.scanner import Scanner, returns
 from cello3d_ros.simulation.worlds import World, build_world
@@ -36,6 +36,7 @@ class Simulation:
     world: the name of a world, or a YAML file with one.  drive: how a robot carries the scanner
     along the world's route; None for a walk with a scan each 0.5 s, each taken at one instant.
     path: a TUM file with the poses of the sensor and their stamps, instead of a route.
+    course: which way a walk takes through the world; None for one that the seed decides.
     title: what it is called instead of by world and seed.
 
     A scan depends on the seed and on its own number only: a longer simulation starts with the
@@ -50,6 +51,7 @@ class Simulation:
     path: Path | None = None
     title: str = ""
     drive: Drive | None = None
+    course: Course | None = None
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -167,7 +169,9 @@ class Simulation:
             if self.path is not None:
                 truth = read_path(self.path, self.n_scans)[1]
             else:
-                truth = walk(world.route, self.n_scans, way.uniform(0.9, 1.5), way)
+                if self.course is not None:
+                    way = np.random.default_rng([self.seed, self.course.seed])
+                truth = walk(world.route, self.n_scans, way.uniform(0.9, 1.5), way, self.course)
             track = PoseTrack.of_poses(stamps, truth)
         return _Built(world, track, truth, _drifting(truth, self.drive, drift))
 
