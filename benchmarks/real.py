@@ -21,12 +21,12 @@ import numpy as np
 
 from cello3d_ros.config import PIPELINE, Config, NodeConfig
 from cello3d_ros.covariance.lost import is_lost
-from cello3d_ros.covariance.model import Model, find_model, load_model, predict
+from cello3d_ros.covariance.model import Model, find_model, load_model
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.learning.align_report import sentences
 from cello3d_ros.learning.aligned import aligned_parts
 from cello3d_ros.learning.dataset import open_dataset
-from cello3d_ros.learning.examples import load_examples, select_inputs
+from cello3d_ros.learning.examples import answers, load_examples, select_inputs
 from cello3d_ros.learning.measures import figures
 from cello3d_ros.learning.sample import sample
 from cello3d_ros.recordings import open_recording
@@ -66,9 +66,8 @@ def judged(folder: Path, model: Model) -> dict:
     dataset = open_dataset(folder)
     names = {key[0] for key in dataset.pair_keys()}
     examples = select_inputs(load_examples([dataset], names), model.features)
-    S = examples.shapes[model.shape]
-    answers = [predict(model, d[0], S_k) for d, S_k in zip(examples.features, S, strict=True)]
-    found = figures(np.array([answer.covariance for answer in answers]), examples)
+    said = answers(model, examples)
+    found = figures(np.array([answer.covariance for answer in said]), examples)
     quantile = NodeConfig().unknown_quantile
     sandwich = examples.shapes["sandwich"]
     return {
@@ -76,7 +75,7 @@ def judged(folder: Path, model: Model) -> dict:
         "dm2_over_6": found.dm2_over_6,
         "coverage_95": found.coverage_95,
         "kl_median": found.kl_median,
-        "unknown": float(np.mean([answer.novelty > quantile for answer in answers])),
+        "unknown": float(np.mean([answer.novelty > quantile for answer in said])),
         "lost": float(np.mean([is_lost(Y, model.lost) for Y in sandwich])),
     }
 

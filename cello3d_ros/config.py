@@ -147,6 +147,9 @@ class SamplingConfig(Section):
     noise_m: float = _setting(
         0.0, "standard deviation of range noise added at each registration", 0.0, 10.0
     )
+    n_views: int = _setting(
+        1, "places about the recorded ones from which a simulated pair is scanned", 1, 1000
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,6 +160,11 @@ class TrainingConfig(Section):
         "sandwich",
         "what covariances are relative to; none is the paper",
         choices=("none", "hessian", "sandwich"),
+    )
+    frame: str = _setting(
+        "motion",
+        "whose axes examples have: x along the horizontal motion, or those of the sensor (paper)",
+        choices=("motion", "sensor"),
     )
     features: str = _setting(
         "global",

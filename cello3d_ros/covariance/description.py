@@ -11,6 +11,7 @@ from cello3d_ros.config import Pipeline
 from cello3d_ros.covariance.closed_form import closed_form
 from cello3d_ros.covariance.descriptor import describe_clouds, n_features
 from cello3d_ros.covariance.features import global_features
+from cello3d_ros.covariance.heading import motion_of
 from cello3d_ros.errors import NoOverlapError
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.registration.overlap import Overlap, find_overlap
@@ -23,7 +24,8 @@ class Description(NamedTuple):
     descriptors: (n_rotations, n_features), the k-th after a turn of the reading frame by
     2 pi k / n_rotations about z; features: the numbers that ``FEATURES`` names; shapes: cheap
     predictors by name, each (6, 6), reading side; overlap: the associations that all of it comes
-    from; free: the directions of the sensor that no plane holds (``ClosedForm``).
+    from; motion: (2,), what ``motion_of`` finds; free: the directions of the sensor that no plane
+    holds (``ClosedForm``).
     """
 
     n_overlap: int
@@ -32,6 +34,7 @@ class Description(NamedTuple):
     features: Array
     shapes: dict[str, Array]
     overlap: Overlap
+    motion: Array
     free: tuple[str, ...] = ()
 
 
@@ -57,7 +60,14 @@ def describe(
     descriptors = _descriptors(reading, reference, T_ref_read, overlap, pipeline, n_rotations)
     features = global_features(reading, reference, T_ref_read, overlap, found, pipeline.icp)
     return Description(
-        overlap.n_points, overlap.ratio, descriptors, features, shapes, overlap, found.free
+        overlap.n_points,
+        overlap.ratio,
+        descriptors,
+        features,
+        shapes,
+        overlap,
+        motion_of(T_ref_read),
+        found.free,
     )
 
 

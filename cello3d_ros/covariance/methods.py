@@ -14,10 +14,10 @@ from cello3d_ros.covariance.case import Case, MethodSettings
 from cello3d_ros.covariance.closed_form import censi
 from cello3d_ros.covariance.features import model_inputs
 from cello3d_ros.covariance.fused import fused, monte_carlo, registrations
-from cello3d_ros.covariance.model import Model, Prediction, predict
+from cello3d_ros.covariance.model import Model, Prediction, placed, predict
 from cello3d_ros.covariance.sigma_points import sigma_points
 from cello3d_ros.errors import RegistrationError
-from cello3d_ros.geometry.gaussian import is_positive_definite, larger, matrix_sqrt, symmetrized
+from cello3d_ros.geometry.gaussian import is_positive_definite, larger, symmetrized
 from cello3d_ros.geometry.se3 import Array
 
 Method = Callable[[Case], Array]
@@ -30,11 +30,7 @@ def by_model(case: Case) -> Array:
 
 def by_constant(case: Case) -> Array:
     """Return the mean of the model's examples, relative to the pair's shape as they are."""
-    mean = mean_example(case.model)
-    if case.model.shape == "none":
-        return mean
-    root = matrix_sqrt(case.description.shapes[case.model.shape])
-    return symmetrized(root @ mean @ root)
+    return placed(case.model, mean_example(case.model), *_place(case))
 
 
 def by_hessian(case: Case) -> Array:
@@ -102,7 +98,12 @@ def predicted(case: Case) -> Prediction:
     """Return the model's answer with the evidence for it."""
     model, found = case.model, case.description
     inputs = model_inputs(model.features, found.descriptors, found.features)
-    return predict(model, inputs[0], found.shapes.get(model.shape))
+    return predict(model, inputs[0], *_place(case))
+
+
+def _place(case: Case) -> tuple[Array | None, Array]:
+    """Return what places a covariance of the model: the pair's shape and motion."""
+    return case.description.shapes.get(case.model.shape), case.description.motion
 
 
 def widened(prediction: Prediction, case: Case) -> Array:

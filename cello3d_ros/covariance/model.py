@@ -32,6 +32,7 @@ from cello3d_ros.config import (
 )
 from cello3d_ros.covariance.archive import read_arrays, write_arrays
 from cello3d_ros.covariance.features import KINDS
+from cello3d_ros.covariance.heading import FRAMES, blended, out_of_motion
 from cello3d_ros.covariance.lost import Lost
 from cello3d_ros.covariance.sums import pack, squared_distances, unpack, weighted_sum
 from cello3d_ros.errors import ConfigError, ModelError
@@ -39,8 +40,8 @@ from cello3d_ros.geometry.gaussian import is_positive_definite, matrix_sqrt, sym
 from cello3d_ros.geometry.se3 import Array
 
 FORMAT = "cello3d-model"
-FORMAT_VERSION = 3
-_READABLE = (2, FORMAT_VERSION)
+FORMAT_VERSION = 4
+_READABLE = (2, 3, FORMAT_VERSION)
 CONVENTIONS = {
     "order": "u omega",
     "side": "reading: T_hat = T_mean exp(xi)",
@@ -63,7 +64,8 @@ class Model:
     theta: (r, D).  mean, scale: (D,), scaler of the inputs, ``(d - mean) / scale``.
     projections: (N, r), Theta applied to the standardised training inputs.
     covariances: (N, 6, 6), of the sampled registrations; ``S^-1/2 Y S^-1/2`` unless shape is none.
-    shape: what they are relative to.  mean_weight: share of their mean in every prediction.
+    shape: what they are relative to.  frame: whose axes they have, one of ``heading.FRAMES``.
+    mean_weight: share of their mean in every prediction.
     margin: factor on every prediction, for what the training data leave out.
     features: what the inputs are, one of ``features.KINDS``.
     rho_quantiles: (Q,) or empty, evenly spaced quantiles of the nearest rho of the training
@@ -87,6 +89,7 @@ class Model:
     rotations_rad: Array = field(default_factory=lambda: np.zeros(1))
     training_mean: Array = field(default_factory=lambda: np.zeros((0, 6)))
     shape: str = "none"
+    frame: str = "sensor"
     features: str = "descriptor"
     mean_weight: float = 0.0
     margin: float = 1.0
@@ -166,7 +169,12 @@ def weigh(rho: Array) -> Array:
     return np.asarray(w)
 
 
-def predict(model: Model, inputs: ArrayLike, S: ArrayLike | None = None) -> Prediction:
+def predict(
+    model: Model,
+    inputs: ArrayLike,
+    S: ArrayLike | None = None,
+    motion: ArrayLike | None = None,
+) -> Prediction:
     """Return ``F = m S^1/2 [(1 - a) sum_k w_k Y_k + a mean(Y)] S^1/2``.
 
     m is the model's margin, a the mean's weight.  Weights are those of the inputs clipped to the
@@ -174,8 +182,9 @@ def predict(model: Model, inputs: ArrayLike, S: ArrayLike | None = None) -> Pred
     that of the inputs as they are.
 
     inputs: (D,), what ``model_inputs`` gives.  S: (6, 6), the pair's shape that ``model.shape``
-    names, reading side; not looked at when that is none.  Raises ModelError where either does
-    not fit the model.
+    names, reading side; not looked at when that is none.  motion: (2,), what ``motion_of`` finds,
+    along which the Y_k are turned where ``model.frame`` says so.  Raises ModelError where one of
+    them does not fit the model.
     """
     d = np.asarray(inputs, dtype=np.float64)
     if d.shape != (model.n_features,):
@@ -194,7 +203,7 @@ def predict(model: Model, inputs: ArrayLike, S: ArrayLike | None = None) -> Pred
     w = weigh(rho)
     F = unpack(weighted_sum(w, model.packed_covariances))
     F = (1.0 - model.mean_weight) * F + model.mean_weight * model.mean_covariance
-    F = _scaled(model.margin * F, S, model.shape)
+    F = placed(model, model.margin * F, S, motion)
     return Prediction(F, nearest, float(1.0 / (w @ w)), _rank(nearest, model.rho_quantiles))
 
 
@@ -239,7 +248,7 @@ def load_model(name: Path | str = "general") -> Model:
     """
     path = find_model(name)
     header = _read_header(path)
-    is_new = header["format_version"] == FORMAT_VERSION
+    is_new = header["format_version"] > 2
     names = (*_ARRAYS, *_NEW_ARRAYS) if is_new else _ARRAYS
     arrays = read_arrays(path, dict.fromkeys(names, "<f8"))
     if not is_new:
@@ -249,6 +258,7 @@ def load_model(name: Path | str = "general") -> Model:
         return Model(
             **arrays,
             shape=header["shape"],
+            frame=header.get("frame", "sensor"),  # since format 4
             features=header["features"],
             mean_weight=header["mean_weight"],
             margin=header["margin"],
@@ -282,6 +292,7 @@ def _header(model: Model) -> dict[str, Any]:
         "conventions": CONVENTIONS,
         "config": {name: config[name] for name in (*PIPELINE, "sampling")},
         "shape": model.shape,
+        "frame": model.frame,
         "features": model.features,
         "mean_weight": model.mean_weight,
         "margin": model.margin,
@@ -325,7 +336,7 @@ def _read_header(path: Path | str) -> dict[str, Any]:
         raise ModelError(f"{path}: the header is not that of a {FORMAT} file")
     if (version := header.get("format_version")) not in _READABLE:
         raise ModelError(
-            f"{path}: format version {version!r}, this package reads 2 and 3: train it again"
+            f"{path}: format version {version!r}, this package reads 2, 3 and 4: train it again"
         )
     _check_items(header, _header(constant_model(np.eye(6), 1)), f"{path}: header")
     if header["conventions"] != CONVENTIONS:
@@ -336,7 +347,7 @@ def _read_header(path: Path | str) -> dict[str, Any]:
 def _check_items(found: Mapping[str, Any], wanted: Mapping[str, Any], where: str) -> None:
     """Raise ModelError for a missing item; settings within a section may be missing."""
     for name in wanted:
-        if name not in found and name != "lost":
+        if name not in found and name not in ("lost", "frame"):
             raise ModelError(f"{where}: item {name!r} is missing")
     if not isinstance(found["config"], dict):
         raise ModelError(f"{where}: item 'config' holds no sections")
@@ -345,9 +356,19 @@ def _check_items(found: Mapping[str, Any], wanted: Mapping[str, Any], where: str
             raise ModelError(f"{where}: section {name!r} of 'config' is missing")
 
 
-def _scaled(F: Array, S: ArrayLike | None, shape: str) -> Array:
-    """Return ``S^1/2 F S^1/2``, or F itself when covariances are not relative."""
-    if shape != "none":
+def placed(model: Model, F: Array, S: ArrayLike | None, motion: ArrayLike | None) -> Array:
+    """Return what a covariance of the model's examples is for a pair: along its axes, of its size.
+
+    F: (6, 6); S, motion: as of ``predict``, which says how.
+    """
+    if model.frame == "motion":
+        if motion is None or np.shape(motion) != (2,) or not np.isfinite(motion).all():
+            raise ModelError(
+                f"the model needs the horizontal motion of a pair, two numbers: {motion!r}"
+            )
+        m = np.asarray(motion, dtype=np.float64)
+        F = out_of_motion(blended(F, m), m)
+    if (shape := model.shape) != "none":
         if S is None:
             raise ModelError(f"the model is relative to the {shape} of a pair, and none is given")
         S = np.asarray(S, dtype=np.float64)
@@ -430,6 +451,8 @@ def _check_settings(model: Model) -> None:
         raise ModelError("scale is not positive")
     if model.shape not in SHAPES:
         raise ModelError(f"shape must be one of {', '.join(SHAPES)}: {model.shape!r}")
+    if model.frame not in FRAMES:
+        raise ModelError(f"frame must be one of {', '.join(FRAMES)}: {model.frame!r}")
     if model.features not in KINDS:
         raise ModelError(f"features must be one of {', '.join(KINDS)}: {model.features!r}")
     if not 0.0 <= _number("mean_weight", model.mean_weight) <= 1.0:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cello3d_ros.config import differences
 from cello3d_ros.covariance.case import MethodSettings
 from cello3d_ros.covariance.methods import METHODS, extra_runs, mean_example
-from cello3d_ros.covariance.model import Model, predict
+from cello3d_ros.covariance.model import Model, placed
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.evaluation.online import Answer
 from cello3d_ros.evaluation.result import Calibration, Group
@@ -20,10 +20,10 @@ from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import Dataset
 from cello3d_ros.learning.examples import (
     Examples,
+    answers,
     load_examples,
+    places,
     select_inputs,
-    to_absolute,
-    unturned_rows,
 )
 from cello3d_ros.learning.measures import best_scale, figures, select
 
@@ -97,19 +97,17 @@ def from_dataset(
     _check_settings(model, examples)
     examples = select_inputs(examples, model.features)
     n = len(examples.covariances)
-    row = unturned_rows(examples).start
-    S: Sequence[Array | None] = [None] * n
-    if model.shape != "none":
-        S = list(examples.shapes[model.shape])
-    answers = [predict(model, d[row], S_k) for d, S_k in zip(examples.features, S, strict=True)]
-    constant = to_absolute(np.tile(mean_example(model), (n, 1, 1)), examples, model.shape)
+    found, mean_of_examples = answers(model, examples), mean_example(model)
+    constant = np.array(
+        [placed(model, mean_of_examples, *place) for place in places(model, examples)]
+    )
     covariances = {
         BASELINE: np.tile(mean, (n, 1, 1)),
-        "cello3d": np.array([answer.covariance for answer in answers]),
-        "cello3d_widened": np.array([answer.covariance for answer in answers]),
+        "cello3d": np.array([answer.covariance for answer in found]),
+        "cello3d_widened": np.array([answer.covariance for answer in found]),
         "constant": constant,
     }
-    for k, answer in enumerate(answers):
+    for k, answer in enumerate(found):
         if answer.novelty > settings.unknown_quantile:
             covariances["cello3d_widened"][k] = larger(constant[k], answer.covariance)
     if "hessian" in examples.shapes:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from cello3d_ros.config import Pipeline, SamplingConfig, differences
 from cello3d_ros.covariance.features import model_inputs
+from cello3d_ros.covariance.heading import blended, into_motion, motion_of, out_of_motion
+from cello3d_ros.covariance.model import Model, Prediction, predict
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.geometry.gaussian import matrix_inverse_sqrt, matrix_sqrt, symmetrized
 from cello3d_ros.geometry.se3 import Array, adjoint, exp
@@ -22,7 +24,7 @@ from cello3d_ros.learning.dataset import Dataset, PairRecord
 Indices = NDArray[np.intp]
 
 # sampling settings in which datasets may differ
-_FREE = ("seed", "n_samples", "min_samples", "precision", "max_gap")
+_FREE = ("seed", "n_samples", "min_samples", "precision", "max_gap", "n_views")
 _MAX_SAMPLES = 200  # errors of each pair kept for the coverage
 
 
@@ -31,7 +33,8 @@ class Examples:
     """Accepted pairs of some recordings; nothing is relative or turned yet but the features.
 
     features: (N, n_rotations, D) descriptors of the pair turned about z by ``rotations_rad``;
-    after ``select_inputs`` what a model looks at.  global_features: (N, G).
+    after ``select_inputs`` what a model looks at.  global_features: (N, G).  motions: (N, 2), what
+    ``motion_of`` finds in the true T_ref_read.
     covariances: (N, 6, 6).  groups: (N,) names of recordings.  shapes: name -> (N, 6, 6).
     xi: N arrays (n, 6), some of the errors that made each covariance.  lost_xi: (M, 6), the errors
     of all their registrations that ended in another minimum.
@@ -43,6 +46,7 @@ class Examples:
     shapes: dict[str, Array]
     rotations_rad: Array
     global_features: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
+    motions: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
     xi: tuple[Array, ...] = ()
     lost_xi: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 6)))
     rejected: dict[str, int] = dataclasses.field(default_factory=dict)  # reason -> pairs
@@ -103,11 +107,57 @@ def to_relative(examples: Examples, shape: str) -> Array:
     return symmetrized(root @ examples.covariances @ root)
 
 
-def to_absolute(relative: Array, examples: Examples, shape: str) -> Array:
+def targets_of(examples: Examples, shape: str, frame: str) -> Array:
+    """Return what a model is to predict of each pair: relative, along the axes of the frame."""
+    Y = to_relative(examples, shape)
+    return into_motion(Y, _motions(examples)) if frame == "motion" else Y
+
+
+def examples_of(examples: Examples, shape: str, frame: str) -> Array:
+    """Return the covariances that a model holds, of each pair its turns.  (N R, 6, 6).
+
+    In the motion frame a pair turned about z is the same pair.
+    """
+    Y = targets_of(examples, shape, frame)
+    if frame == "sensor":
+        return turn(Y, examples.rotations_rad)
+    return np.repeat(blended(Y, _motions(examples)), len(examples.rotations_rad), axis=0)
+
+
+def motions_of(examples: Examples, frame: str) -> Array | None:
+    """Return the motions (N, 2) along which predictions lie; None in the sensor's frame."""
+    return _motions(examples) if frame == "motion" else None
+
+
+def _motions(examples: Examples) -> Array:
+    if len(examples.motions) != len(examples.covariances):
+        raise DatasetError("the examples hold no motions: train with frame sensor")
+    return examples.motions
+
+
+def to_absolute(relative: Array, examples: Examples, shape: str, frame: str) -> Array:
+    """Return the covariances of pairs from what ``targets_of`` makes of them."""
+    if frame == "motion":
+        relative = out_of_motion(relative, _motions(examples))
     if shape == "none":
         return relative
     root = matrix_sqrt(examples.shapes[shape])
     return symmetrized(root @ relative @ root)
+
+
+def places(model: Model, examples: Examples) -> list[tuple[Array | None, Array | None]]:
+    """Return what places a covariance of the model for each pair: its shape and its motion."""
+    n = len(examples.covariances)
+    shapes = [None] * n if model.shape == "none" else list(examples.shapes[model.shape])
+    motions = [None] * n if model.frame == "sensor" else list(_motions(examples))
+    return list(zip(shapes, motions, strict=True))
+
+
+def answers(model: Model, examples: Examples) -> list[Prediction]:
+    """Return what a model says of each pair.  examples: after ``select_inputs``."""
+    row = unturned_rows(examples).start
+    pairs = zip(examples.features, places(model, examples), strict=True)
+    return [predict(model, d[row], *place) for d, place in pairs]
 
 
 def turn(Y: Array, rotations_rad: Array) -> Array:
@@ -183,6 +233,7 @@ def _stacked(records: list[PairRecord], dataset: Dataset) -> Examples:
         features=np.array([record.descriptors for record in accepted]),
         covariances=np.array([record.covariance for record in accepted]),
         global_features=np.array([record.features for record in accepted]),
+        motions=np.array([motion_of(record.T_mean) for record in accepted]),
         groups=np.array([record.recording for record in accepted]),
         shapes={n: np.array([record.shapes[n] for record in accepted]) for n in sorted(names)},
         rotations_rad=first.rotations_rad,

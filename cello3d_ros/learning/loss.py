@@ -17,14 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from cello3d_ros.config import TrainingConfig
+from cello3d_ros.covariance.heading import blended
 from cello3d_ros.covariance.sums import TWICE, pack, unpack
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.examples import (
     Examples,
     Indices,
+    examples_of,
     flat_features,
-    to_relative,
-    turn,
+    motions_of,
+    targets_of,
     unturned_rows,
 )
 
@@ -37,6 +39,7 @@ class Problem:
 
     X: (K, D) standardised features.  Y: (K, 6, 6).  groups: (K,).  The same of the M examples,
     with covariances packed (M, 21).  means: (K, 21), of the examples each target may see.
+    motions: (K, 2) along which targets and predictions lie, or None in the frame of the sensor.
     """
 
     X: Array
@@ -47,6 +50,7 @@ class Problem:
     groups_examples: Indices
     means: Array
     mean_weight: float
+    motions: Array | None = None
 
 
 def leave_out_problem(
@@ -55,14 +59,14 @@ def leave_out_problem(
     """Return the problem of predicting each pair from the other recordings."""
     n_rotations = len(examples.rotations_rad)
     groups = np.unique(examples.groups, return_inverse=True)[1].astype(np.intp)
-    Y = to_relative(examples, config.shape)
-    packed = pack(turn(Y, examples.rotations_rad))
+    packed = pack(examples_of(examples, config.shape, config.frame))
     groups_examples = np.repeat(groups, n_rotations)
     others = [packed[groups_examples != group].mean(axis=0) for group in range(groups.max() + 1)]
     X = (flat_features(examples) - mean) / scale
     return Problem(
         X=X[unturned_rows(examples)],
-        Y=Y,
+        Y=targets_of(examples, config.shape, config.frame),
+        motions=motions_of(examples, config.frame),
         groups=groups,
         X_examples=X,
         packed_examples=packed,
@@ -76,11 +80,12 @@ def validation_problem(
     problem: Problem, validation: Examples, config: TrainingConfig, mean: Array, scale: Array
 ) -> Problem:
     """Return the problem of predicting other recordings from all examples of ``problem``."""
-    Y = to_relative(validation, config.shape)
+    Y = targets_of(validation, config.shape, config.frame)
     return dataclasses.replace(
         problem,
         X=((flat_features(validation) - mean) / scale)[unturned_rows(validation)],
         Y=Y,
+        motions=motions_of(validation, config.frame),
         groups=np.full(len(Y), -1),
         means=np.tile(problem.packed_examples.mean(axis=0), (len(Y), 1)),
     )
@@ -98,6 +103,8 @@ def select_features(problem: Problem, active: Indices) -> Problem:
 def select_targets(problem: Problem, rows: Indices) -> Problem:
     """Return the problem of predicting some of the targets, from all examples."""
     chosen = {name: getattr(problem, name)[rows] for name in ("X", "Y", "groups", "means")}
+    if problem.motions is not None:
+        chosen["motions"] = problem.motions[rows]
     return dataclasses.replace(problem, **chosen)
 
 
@@ -131,6 +138,7 @@ def loss_and_gradient(
         s = _weights(P, P_examples, problem, block)
         losses, G = pair_losses(_mixed(s, problem, block), problem.Y[block], loss)
         total += losses.sum()
+        G = _blended(G, problem, block)
         g = (pack(G) * TWICE) @ problem.packed_examples.T
         c = -(1.0 - problem.mean_weight) / n_targets * s * (g - (s * g).sum(axis=1, keepdims=True))
         gradient += _outer(c.sum(axis=1)[:, None] * P - c @ P_examples, problem.X[block], theta)
@@ -194,7 +202,13 @@ def _weights(P: Array, P_examples: Array, problem: Problem, block: slice) -> Arr
 def _mixed(s: Array, problem: Problem, block: slice) -> Array:
     """Return F of the targets of a block from their weights."""
     w = problem.mean_weight
-    return unpack((1.0 - w) * (s @ problem.packed_examples) + w * problem.means[block])
+    F = unpack((1.0 - w) * (s @ problem.packed_examples) + w * problem.means[block])
+    return _blended(F, problem, block)
+
+
+def _blended(A: Array, problem: Problem, block: slice) -> Array:
+    """Return what of A is left where targets have little motion; it is its own adjoint."""
+    return A if problem.motions is None else blended(A, problem.motions[block])
 
 
 def _projected(X: Array, theta: Array) -> Array:

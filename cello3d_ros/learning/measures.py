@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from cello3d_ros.config import TrainingConfig
+from cello3d_ros.covariance.heading import blended
 from cello3d_ros.geometry.gaussian import kl, mahalanobis
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.learning.examples import Examples, to_absolute, to_relative
+from cello3d_ros.learning.examples import Examples, targets_of, to_absolute
 from cello3d_ros.learning.loss import Problem, predicted
 
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
@@ -93,17 +94,20 @@ def evaluate(
     mean_covariance is the mean of the absolute covariances (the paper's baseline), of other
     recordings as they were recorded; constant is that of the relative ones.
     """
-    relative = to_relative(examples, config.shape)
+    relative = targets_of(examples, config.shape, config.frame)
     names = np.unique(targets.groups)
     absolute_means, relative_means = (
         {name: Y[examples.groups != name].mean(axis=0) for name in names}
         for Y in (examples.covariances, relative)
     )
     constant = np.array([relative_means[name] for name in targets.groups])
+    kind = config.shape, config.frame
+    if problem.motions is not None:
+        constant = blended(constant, problem.motions)
     F = {
-        "cello3d": to_absolute(config.margin * predicted(theta, problem), targets, config.shape),
+        "cello3d": to_absolute(config.margin * predicted(theta, problem), targets, *kind),
         "mean_covariance": np.array([absolute_means[name] for name in targets.groups]),
-        "constant": to_absolute(constant, targets, config.shape),
+        "constant": to_absolute(constant, targets, *kind),
     }
     return {name: figures(Fs, targets) for name, Fs in F.items()}
 
@@ -187,6 +191,7 @@ def select(examples: Examples, keep: NDArray[np.bool_]) -> Examples:
         examples,
         features=examples.features[keep],
         global_features=examples.global_features[keep[: len(examples.global_features)]],
+        motions=examples.motions[keep[: len(examples.motions)]],
         covariances=examples.covariances[keep],
         groups=examples.groups[keep],
         shapes={name: S[keep] for name, S in examples.shapes.items()},

@@ -1,9 +1,11 @@
-"""Monte Carlo with sensor noise: every registration sees other ranges.
+"""Monte Carlo with sensor noise or from other places: registrations see other ranges.
 
 Source: the sampled covariances of Bengtsson & Baerveldt 2003 and Iversen et al. 2017.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +15,13 @@ from cello3d_ros.clouds.neighbors import build_tree
 from cello3d_ros.clouds.shape import Cloud, prepare
 from cello3d_ros.config import IcpConfig, Pipeline
 from cello3d_ros.errors import CloudError
-from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.geometry.se3 import Array, exp, inverse
 from cello3d_ros.registration.backends import register
 from cello3d_ros.registration.icp import Registration
 from cello3d_ros.simulation.scanner import Echoes, measure
+
+Look = Callable[[Array], Echoes]  # what a scan's beams meet from a pose T_world_sensor
+_VIEW_M, _VIEW_RAD = 0.1, 0.035  # standard deviations of another view, along each axis
 
 
 def register_noisy(
@@ -59,6 +64,29 @@ def register_rescanned(
     except CloudError:
         return Registration(T_init, 0, False, "too_few_points", np.inf, 0)
     return register(P, Q, T_init, pipeline.icp, rng)
+
+
+def seen_from(
+    pair: tuple[Look, Look],
+    T_world: tuple[Array, Array],
+    pipeline: Pipeline,
+    rng: np.random.Generator,
+) -> tuple[Cloud, Cloud]:
+    """Scan a pair from another place nearby, with the same motion between its scans.
+
+    pair, T_world: how to scan and the poses (4, 4), of the reading and of the reference.  Both are
+    carried along by ``T_reading exp(e)``, e ~ N(0, diag(0.1^2 I m^2, 0.035^2 I rad^2)): the beams
+    fall elsewhere on the same surfaces, so that the bias of ICP is another draw while T_ref_read
+    stays.  Noise and filters are of this view.  Raises CloudError.
+    """
+    T_read, T_ref = T_world
+    moved = T_read @ exp(rng.normal(size=6) * np.repeat([_VIEW_M, _VIEW_RAD], 3))
+    poses = moved, moved @ inverse(T_read) @ T_ref
+    P, Q = (
+        prepare(measure(look(T), rng), pipeline.cloud, rng)
+        for look, T in zip(pair, poses, strict=True)
+    )
+    return P, Q
 
 
 def noisy(

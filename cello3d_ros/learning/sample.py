@@ -53,7 +53,7 @@ def sample(
     """
     config = config or Config()
     sampling, pipeline = config.sampling, pipeline_of(config)
-    opened = _opened(recordings, sampling.noise_m > 0.0)
+    opened = _opened(recordings, sampling.noise_m > 0.0 or sampling.n_views > 1)
     for recording in opened.values():
         report(Status(f"reading {recording.name}"))
         _check_usable(recording)
@@ -113,9 +113,16 @@ def _add(dataset: Dataset, recording: Recording) -> None:
     if isinstance(recording, AlignedPart):
         source = recording.recording
         facts |= pose_facts(recording)
+    if dataset.sampling.n_views > 1:
+        facts["views"] = dataset.sampling.n_views if _can_look(source) else 1
     if dataset.sampling.noise_m > 0.0:
         facts["noise"] = "rescans" if isinstance(source, Simulation) else "added"
     dataset.add_recording(recording.name, facts)
+
+
+def _can_look(source: Recording) -> bool:
+    """Return whether scans of a recording can be taken from elsewhere."""
+    return isinstance(source, Simulation) and not (source.drive and source.drive.sweeps)
 
 
 def _sample(

@@ -24,7 +24,7 @@ from cello3d_ros.geometry.gaussian import is_positive_definite, sampled_covarian
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log
 from cello3d_ros.learning.clustering import nearest_cluster, offset
 from cello3d_ros.learning.dataset import PairRecord
-from cello3d_ros.learning.noise import register_noisy, register_rescanned
+from cello3d_ros.learning.noise import Look, register_noisy, register_rescanned, seen_from
 from cello3d_ros.recordings.recording import Recording, Scan
 from cello3d_ros.registration.backends import register, register_many
 from cello3d_ros.registration.icp import Registration
@@ -46,11 +46,15 @@ class NoTruthError(CloudError):
 
 
 class Prepared(NamedTuple):
-    """A scan's cloud, or why it has none; its true pose; if wanted, how to scan it again."""
+    """A scan's cloud, or why it has none; its true pose; if wanted, how to scan it again.
+
+    echoes: from where it was; look: from elsewhere.
+    """
 
     cloud: Cloud | CloudError
     T_world_sensor: Array
     echoes: Echoes | None = None
+    look: Look | None = None
 
 
 class Pair(NamedTuple):
@@ -148,8 +152,9 @@ def sample_pair(
 
     Each start is ``T_mean exp(xi)``, xi ~ N(0, variance I), and
     each registration draws its own subsamples; with ``noise_m`` also noise, or where there are
-    echoes, two new scans.  There are ``n_samples`` of them, or fewer where
-    ``precision`` is reached before: the record is then that of the smaller ``n_samples``.
+    echoes, two new scans.  With ``n_views`` the k-th sees the pair from place k modulo n_views,
+    where the scans can be looked at from elsewhere.  There are ``n_samples`` of them, or fewer
+    where ``precision`` is reached before: the record is then that of the smaller ``n_samples``.
     Source: Sec. IV-D, V-A.
     """
     record = describe_pair(pair, pipeline, sampling)
@@ -229,9 +234,11 @@ def register_block(
         scale=np.sqrt(sampling.variance), size=(stop, 6)
     )[start:]
     seeds = [[*seed, 1, k] for k in range(start, stop)]
-    results = _registrations(
-        pair, pipeline, sampling.noise_m, pair.T_mean @ exp(starts), seeds, n_threads
-    )
+    T_inits = pair.T_mean @ exp(starts)
+    if sampling.n_views > 1 and pair.reading.look and pair.reference.look:
+        results = _from_views(pair, pipeline, sampling, T_inits, seeds, n_threads)
+    else:
+        results = _registrations(pair, pipeline, sampling.noise_m, T_inits, seeds, n_threads)
     answers = [
         result for result in results if result.has_answer and np.isfinite(result.T_ref_read).all()
     ]
@@ -264,6 +271,42 @@ def _registrations(
         return register_noisy(reading, reference, T_inits[k], pipeline.icp, noise_m, rng)
 
     return in_threads(one, range(len(T_inits)), n_threads)
+
+
+def _from_views(
+    pair: Pair,
+    pipeline: Pipeline,
+    sampling: SamplingConfig,
+    T_inits: Array,
+    seeds: list[list[int]],
+    n_threads: int,
+) -> list[Registration]:
+    """Register from many starts, number k in view k modulo ``n_views``."""
+    assert pair.reading.look is not None
+    assert pair.reference.look is not None
+    looks = pair.reading.look, pair.reference.look
+    T_world = pair.reading.T_world_sensor, pair.reference.T_world_sensor
+    of_view = np.array([seed[-1] % sampling.n_views for seed in seeds])
+    views = np.unique(of_view).tolist()
+    found: list[Registration] = [
+        Registration(T, 0, False, "too_few_points", np.inf, 0) for T in T_inits
+    ]
+
+    def one(n: int) -> None:
+        rows = np.flatnonzero(of_view == views[n])
+        rng = np.random.default_rng([*_pair_seed(pair, sampling), 2, views[n]])
+        try:
+            P, Q = seen_from(looks, T_world, pipeline, rng)
+        except CloudError:
+            return
+        own = [seeds[row] for row in rows]
+        for row, result in zip(
+            rows, register_many(P, Q, T_inits[rows], own, pipeline.icp), strict=True
+        ):
+            found[row] = result
+
+    in_threads(one, range(len(views)), n_threads)
+    return found
 
 
 def finish_pair(
@@ -339,7 +382,8 @@ def prepare_scan(
         cloud = prepare(scan.points, pipeline.cloud, rng)
     except CloudError as error:
         return Prepared(error, T_world_sensor)
-    return Prepared(cloud, T_world_sensor, scan.echoes if sampling.noise_m > 0.0 else None)
+    echoes = scan.echoes if sampling.noise_m > 0.0 else None
+    return Prepared(cloud, T_world_sensor, echoes, scan.look if sampling.n_views > 1 else None)
 
 
 def check_complete(name: str, n_read: int, needed: set[int]) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from cello3d_ros.config import TrainingConfig
+from cello3d_ros.covariance.heading import mean_of_turns
 from cello3d_ros.covariance.lost import Lost, spread_m
 from cello3d_ros.covariance.model import Model, project
 from cello3d_ros.covariance.sums import unpack
@@ -129,6 +130,7 @@ def _model(
         projections=project(flat_features(examples), theta, mean, scale),
         covariances=unpack(problem.packed_examples),
         shape=config.shape,
+        frame=config.frame,
         features=config.features,
         rho_quantiles=np.quantile(nearest_rho(theta, problem), _LEVELS),
         input_range=_input_range(examples, config),
@@ -136,7 +138,7 @@ def _model(
         training_mean=examples.covariances.mean(axis=0),
         mean_weight=config.mean_weight,
         margin=config.margin,
-        lost=None if config.shape == "none" else known_lost(examples),
+        lost=None if config.shape == "none" else known_lost(examples, config.frame),
         pipeline=examples.pipeline,
         sampling=examples.sampling,
         provenance={
@@ -173,15 +175,17 @@ def _input_range(examples: Examples, config: TrainingConfig) -> Array:
     return np.stack([rows.min(axis=0), rows.max(axis=0)])
 
 
-def known_lost(examples: Examples) -> Lost | None:
+def known_lost(examples: Examples, frame: str = "sensor") -> Lost | None:
     """Return how to tell registrations in other minima; None where too few were met.
 
     The limit is what the sandwiches of 3 % of the pairs exceed where ICP started from the truth.
+    In the motion frame the scatter of those in other minima has no direction.
     """
     if len(examples.lost_xi) < _FEWEST_LOST or "sandwich" not in examples.shapes:
         return None
     limit_m = np.quantile(spread_m(examples.shapes["sandwich"]), _LOST_QUANTILE)
-    return Lost(float(limit_m), sampled_covariance(examples.lost_xi))
+    scatter = sampled_covariance(examples.lost_xi)
+    return Lost(float(limit_m), mean_of_turns(scatter) if frame == "motion" else scatter)
 
 
 class _Search:

@@ -11,19 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.config import differences
-from cello3d_ros.covariance.model import Model, predict, project
+from cello3d_ros.covariance.model import Model, project
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.geometry.gaussian import kl
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import Dataset
 from cello3d_ros.learning.examples import (
     Examples,
+    answers,
+    examples_of,
     flat_features,
     load_examples,
     select_inputs,
-    to_relative,
-    turn,
-    unturned_rows,
 )
 from cello3d_ros.learning.measures import Figures, figures, pose_check, select
 
@@ -111,11 +110,7 @@ def tune(model: Model, dataset: Dataset) -> Tuning:
 
 def predictions(model: Model, examples: Examples) -> Array:
     """Return what a model says of pairs, (N, 6, 6).  examples: after ``select_inputs``."""
-    row = unturned_rows(examples).start
-    shapes = [None] * len(examples.covariances)
-    S = list(examples.shapes[model.shape]) if model.shape != "none" else shapes
-    rows = zip(examples.features, S, strict=True)
-    return np.array([predict(model, d[row], S_k).covariance for d, S_k in rows])
+    return np.array([answer.covariance for answer in answers(model, examples)])
 
 
 def resized(model: Model, scale: float) -> Model:
@@ -126,7 +121,7 @@ def resized(model: Model, scale: float) -> Model:
 def extended(model: Model, examples: Examples, scale: float) -> Model:
     """Return the model with its examples multiplied and those of a recording beside them."""
     X = flat_features(examples)
-    relative = to_relative(examples, model.shape) / model.margin
+    own = examples_of(examples, model.shape, model.frame) / model.margin
     low, high = X.min(axis=0), X.max(axis=0)
     if len(model.input_range):
         low = np.minimum(low, model.input_range[0])
@@ -136,9 +131,7 @@ def extended(model: Model, examples: Examples, scale: float) -> Model:
         projections=np.concatenate(
             [model.projections, project(X, model.theta, model.mean, model.scale)]
         ),
-        covariances=np.concatenate(
-            [scale * model.covariances, turn(relative, examples.rotations_rad)]
-        ),
+        covariances=np.concatenate([scale * model.covariances, own]),
         input_range=np.stack([low, high]) if len(model.input_range) else model.input_range,
         training_mean=scale * model.training_mean,
     )

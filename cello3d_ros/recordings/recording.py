@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -35,6 +35,7 @@ class Scan:
         damaged; or None.
     echoes: of a simulated scan, what its beams met (``simulation.scanner.Echoes``), from which it
         can be scanned again; or None.
+    look: of a simulated scan, returns the echoes at its time from another pose; or None.
     """
 
     stamp_ns: int
@@ -44,6 +45,7 @@ class Scan:
     intensity: Array | None = None
     time_s: Array | None = None
     echoes: Any = None
+    look: Callable[[Array], Any] | None = None
 
     def __post_init__(self) -> None:
         for name in ("intensity", "time_s"):

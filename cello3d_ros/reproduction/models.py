@@ -22,6 +22,7 @@ from cello3d_ros.reproduction.sequences import SEQUENCES
 #: descriptors as they are.  Its Theta starts near 0, as that of the authors' program does.
 PRINTED = TrainingConfig(
     shape="none",
+    frame="sensor",
     features="descriptor",
     standardize=False,
     theta="upper_triangular",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -116,6 +117,9 @@ class Simulation:
                 T_odom_sensor=built.odometry[k],
                 time_s=None if after is None else after[beams],
                 echoes=echoes if after is None else None,
+                look=partial(cast, around, self.scanner, turn=k, time_s=time_s)
+                if after is None
+                else None,
             )
 
     def track(self) -> PoseTrack:

@@ -414,7 +414,7 @@ def test_the_same_model_makes_the_same_bytes_without_pickle(saved: Path, tmp_pat
     with np.load(saved, allow_pickle=False) as archive:
         assert {archive[name].dtype.kind for name in archive.files} == {"f", "u"}
         header = json.loads(archive["header"].tobytes())
-    assert header["format_version"] == 3
+    assert header["format_version"] == 4
     assert header["conventions"]["order"] == "u omega"
     assert header["config"]["sampling"]["variance"] == SamplingConfig().variance
 
