@@ -62,6 +62,7 @@ def synthetic(n_pairs: int, n_rotations: int, n_features: int) -> Examples:
     return Examples(
         features=features,
         covariances=sizes[:, None, None] * (A @ np.swapaxes(A, 1, 2)),
+        motions=rng.normal(size=(n_pairs, 2)),
         groups=np.array([f"recording{k % 10}" for k in range(n_pairs)]),
         shapes={},
         rotations_rad=2.0 * np.pi * np.arange(n_rotations) / n_rotations,

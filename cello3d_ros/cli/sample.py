@@ -97,6 +97,8 @@ def _sampler(arguments: argparse.Namespace, config: Config) -> Iterator[Sampler 
         return
     if arguments.block < 1:
         raise ConfigError(f"--block must be at least 1: {arguments.block}")
+    if config.sampling.n_views > 1:
+        raise ConfigError("sampling.n_views needs the simulated world: leave --scheduler out")
     import logging
 
     from cello3d_ros.learning.cluster import Job, connected, sample_recording_on

@@ -338,7 +338,10 @@ def _read_header(path: Path | str) -> dict[str, Any]:
         raise ModelError(
             f"{path}: format version {version!r}, this package reads 2, 3 and 4: train it again"
         )
-    _check_items(header, _header(constant_model(np.eye(6), 1)), f"{path}: header")
+    wanted = _header(constant_model(np.eye(6), 1))
+    if version < FORMAT_VERSION:
+        del wanted["frame"]
+    _check_items(header, wanted, f"{path}: header")
     if header["conventions"] != CONVENTIONS:
         raise ModelError(f"{path}: conventions are {header['conventions']}, not {CONVENTIONS}")
     return header
@@ -347,7 +350,7 @@ def _read_header(path: Path | str) -> dict[str, Any]:
 def _check_items(found: Mapping[str, Any], wanted: Mapping[str, Any], where: str) -> None:
     """Raise ModelError for a missing item; settings within a section may be missing."""
     for name in wanted:
-        if name not in found and name not in ("lost", "frame"):
+        if name not in found and name != "lost":
             raise ModelError(f"{where}: item {name!r} is missing")
     if not isinstance(found["config"], dict):
         raise ModelError(f"{where}: item 'config' holds no sections")

@@ -117,7 +117,7 @@ def _owned(scan: Prepared) -> Prepared:
     Those are read-only views of a message, aligned to no multiple of anything: every kernel would
     be compiled again for them, and numpy multiplies them in another way, to other last bits.
     """
-    cloud, T_world_sensor, echoes, look = scan
+    cloud, T_world_sensor, echoes, _ = scan
     if isinstance(cloud, CloudError) or cloud.points.flags.writeable:
         return scan
     tree = KdTree._make(np.array(array) for array in cloud.tree)
@@ -125,7 +125,7 @@ def _owned(scan: Prepared) -> Prepared:
     if echoes is not None:
         echoes = Echoes._make(np.array(v) if isinstance(v, np.ndarray) else v for v in echoes)
     cloud = cloud._replace(tree=tree, **arrays)
-    return Prepared(cloud, np.array(T_world_sensor, order="C"), echoes, look)
+    return Prepared(cloud, np.array(T_world_sensor, order="C"), echoes)
 
 
 class _Reader:

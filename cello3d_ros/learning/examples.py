@@ -42,11 +42,11 @@ class Examples:
 
     features: NDArray[np.floating[Any]]
     covariances: Array
+    motions: Array
     groups: NDArray[np.str_]
     shapes: dict[str, Array]
     rotations_rad: Array
     global_features: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
-    motions: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
     xi: tuple[Array, ...] = ()
     lost_xi: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 6)))
     rejected: dict[str, int] = dataclasses.field(default_factory=dict)  # reason -> pairs
@@ -110,7 +110,7 @@ def to_relative(examples: Examples, shape: str) -> Array:
 def targets_of(examples: Examples, shape: str, frame: str) -> Array:
     """Return what a model is to predict of each pair: relative, along the axes of the frame."""
     Y = to_relative(examples, shape)
-    return into_motion(Y, _motions(examples)) if frame == "motion" else Y
+    return into_motion(Y, examples.motions) if frame == "motion" else Y
 
 
 def examples_of(examples: Examples, shape: str, frame: str) -> Array:
@@ -121,24 +121,18 @@ def examples_of(examples: Examples, shape: str, frame: str) -> Array:
     Y = targets_of(examples, shape, frame)
     if frame == "sensor":
         return turn(Y, examples.rotations_rad)
-    return np.repeat(blended(Y, _motions(examples)), len(examples.rotations_rad), axis=0)
+    return np.repeat(blended(Y, examples.motions), len(examples.rotations_rad), axis=0)
 
 
 def motions_of(examples: Examples, frame: str) -> Array | None:
     """Return the motions (N, 2) along which predictions lie; None in the sensor's frame."""
-    return _motions(examples) if frame == "motion" else None
-
-
-def _motions(examples: Examples) -> Array:
-    if len(examples.motions) != len(examples.covariances):
-        raise DatasetError("the examples hold no motions: train with frame sensor")
-    return examples.motions
+    return examples.motions if frame == "motion" else None
 
 
 def to_absolute(relative: Array, examples: Examples, shape: str, frame: str) -> Array:
     """Return the covariances of pairs from what ``targets_of`` makes of them."""
     if frame == "motion":
-        relative = out_of_motion(relative, _motions(examples))
+        relative = out_of_motion(relative, examples.motions)
     if shape == "none":
         return relative
     root = matrix_sqrt(examples.shapes[shape])
@@ -149,7 +143,7 @@ def places(model: Model, examples: Examples) -> list[tuple[Array | None, Array |
     """Return what places a covariance of the model for each pair: its shape and its motion."""
     n = len(examples.covariances)
     shapes = [None] * n if model.shape == "none" else list(examples.shapes[model.shape])
-    motions = [None] * n if model.frame == "sensor" else list(_motions(examples))
+    motions = [None] * n if model.frame == "sensor" else list(examples.motions)
     return list(zip(shapes, motions, strict=True))
 
 

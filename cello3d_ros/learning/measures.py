@@ -191,7 +191,7 @@ def select(examples: Examples, keep: NDArray[np.bool_]) -> Examples:
         examples,
         features=examples.features[keep],
         global_features=examples.global_features[keep[: len(examples.global_features)]],
-        motions=examples.motions[keep[: len(examples.motions)]],
+        motions=examples.motions[keep],
         covariances=examples.covariances[keep],
         groups=examples.groups[keep],
         shapes={name: S[keep] for name, S in examples.shapes.items()},

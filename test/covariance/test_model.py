@@ -529,8 +529,8 @@ def test_a_covariance_that_is_not_positive_definite_is_named(saved: Path) -> Non
 HEADERS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "format": (lambda h: h.update(format="other"), "not that of a cello3d-model file"),
     "version": (
-        lambda h: h.update(format_version=4),
-        "format version 4, this package reads 2 and 3",
+        lambda h: h.update(format_version=5),
+        "format version 5, this package reads 2, 3 and 4",
     ),
     "no version": (lambda h: h.pop("format_version"), "format version None"),
     "order": (lambda h: h["conventions"].update(order="omega u"), "conventions are"),

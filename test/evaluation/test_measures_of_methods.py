@@ -37,6 +37,7 @@ def some(n: int = 8, n_samples: int = 400, seed: int = 0) -> Examples:
     return Examples(
         features=rng.normal(size=(n, 1, 3)).astype(np.float32),
         covariances=Y,
+        motions=np.tile([1.0, 0.0], (n, 1)),
         groups=np.array(["a", "b"])[np.arange(n) % 2],
         shapes={"sandwich": Y / 4.0, "hessian": 100.0 * Y},
         rotations_rad=np.zeros(1),

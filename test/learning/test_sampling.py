@@ -9,7 +9,7 @@ from cello3d_ros.config import CloudConfig, IcpConfig, OverlapConfig, Pipeline, 
 from cello3d_ros.errors import CloudError, RecordingError
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import exp, inverse, log, transform
-from cello3d_ros.learning.noise import noisy
+from cello3d_ros.learning.noise import noisy, seen_from
 from cello3d_ros.learning.sampling import (
     Pair,
     Prepared,
@@ -17,14 +17,19 @@ from cello3d_ros.learning.sampling import (
     eigenvalue_errors,
     finish_pair,
     is_precise,
+    pair_of,
+    prepare_scan,
     register_block,
     sample_pair,
     sample_recording,
     stops,
 )
 from cello3d_ros.recordings.recording import Scan
+from cello3d_ros.registration.backends import register
+from cello3d_ros.simulation.drives import Drive
 from cello3d_ros.simulation.products import SCANNERS
 from cello3d_ros.simulation.scanner import Echoes, measure
+from cello3d_ros.simulation.simulation import Simulation
 
 PIPELINE = Pipeline(
     cloud=CloudConfig(voxel_m=0.1),
@@ -413,3 +418,58 @@ def test_registrations_without_an_answer_are_counted_and_left_out(room, monkeypa
 def test_clouds_with_fewer_points_than_neighbors_are_no_clouds():
     with pytest.raises(CloudError, match="3 of 3 points are left"):
         cloud(np.ones((3, 3)) * np.arange(1, 4)[:, None])
+
+
+def a_drive(world="rooms", **changes):
+    drive = Drive(**({"speed_m_s": 3.0, "rate_hz": 10.0, "sweeps": False} | changes))
+    return Simulation(world, 3, 2, SCANNERS["spinning16"], drive=drive)
+
+
+def test_another_view_keeps_the_motion_and_sees_other_points():
+    simulation = a_drive()
+    reference, reading = simulation
+    looks, T_world = (
+        (reading.look, reference.look),
+        (reading.T_world_sensor, reference.T_world_sensor),
+    )
+    views = [seen_from(looks, T_world, PIPELINE, np.random.default_rng(k)) for k in range(2)]
+    T = inverse(T_world[1]) @ T_world[0]
+    for P, Q in views:
+        found = register(P, Q, T, PIPELINE.icp, np.random.default_rng(0))
+        assert np.abs(log(inverse(T) @ found.T_ref_read)[:2]).max() < 0.02
+    spread = np.linalg.norm(views[0][0].points.mean(axis=0) - views[1][0].points.mean(axis=0))
+    assert spread > 0.01
+
+
+def test_registrations_from_several_views_are_the_same_for_any_blocks_and_threads():
+    sampling = dataclasses.replace(SAMPLING, n_samples=52, n_views=5)
+    simulation = a_drive()
+    scans = [prepare_scan(s, "a", k, PIPELINE, sampling) for k, s in enumerate(simulation)]
+    pair = pair_of("a", 0, 1, *scans)
+    whole = register_block(pair, PIPELINE, sampling, 0, 52, n_threads=2)
+    parts = [register_block(pair, PIPELINE, sampling, a, b) for a, b in ((0, 7), (7, 52))]
+    np.testing.assert_array_equal(whole.xi, np.concatenate([part.xi for part in parts]))
+
+
+def test_views_hold_more_of_the_bias_than_one_place():
+    """With all points the scatter within a view is small, the offset is each view's own."""
+    whole = Pipeline(icp=IcpConfig(n_reading_points=5000, n_reference_points=0))
+    settings = dataclasses.replace(SAMPLING, n_views=5)
+    found = next(sample_recording(a_drive("office"), [(0, 1)], whole, settings))
+    views = [found.xi[k::5, :2] for k in range(5)]
+    within = np.sqrt(np.mean([view.var(axis=0, ddof=1) for view in views], axis=0))
+    between = np.std([view.mean(axis=0) for view in views], axis=0, ddof=1)
+    assert (between / (within / np.sqrt(10))).max() > 3.0
+
+
+def test_a_recording_that_cannot_be_seen_from_elsewhere_is_sampled_from_where_it_was():
+    sampling = dataclasses.replace(SAMPLING, n_views=5)
+    swept = a_drive(sweeps=True)
+    assert all(scan.look is None for scan in swept)
+    scans = [dataclasses.replace(scan, look=None, time_s=None) for scan in a_drive()]
+    recorded = Recorded("a", scans)
+    found = [
+        next(sample_recording(recorded, [(0, 1)], PIPELINE, settings))
+        for settings in (SAMPLING, sampling)
+    ]
+    np.testing.assert_array_equal(found[0].xi, found[1].xi)

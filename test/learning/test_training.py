@@ -15,7 +15,7 @@ from cello3d_ros.errors import ConfigError, DatasetError
 from cello3d_ros.geometry.gaussian import is_positive_definite, kl, matrix_sqrt
 from cello3d_ros.geometry.se3 import Array, adjoint, exp
 from cello3d_ros.learning.dataset import Dataset, PairRecord, open_dataset
-from cello3d_ros.learning.examples import Examples, feature_scaler, load_examples
+from cello3d_ros.learning.examples import Examples, answers, feature_scaler, load_examples
 from cello3d_ros.learning.loss import (
     Problem,
     leave_out_problem,
@@ -26,7 +26,12 @@ from cello3d_ros.learning.loss import (
 from cello3d_ros.learning.training import fit, known_lost
 
 PAPER = TrainingConfig(
-    features="descriptor", shape="none", theta="diagonal", mean_weight=0.0, regularization=1e-3
+    features="descriptor",
+    shape="none",
+    frame="sensor",
+    theta="diagonal",
+    mean_weight=0.0,
+    regularization=1e-3,
 )
 SIZE = np.diag([1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2])  # det of SIZE SIZE^T is 1e-24
 
@@ -44,6 +49,7 @@ def some(
     return Examples(
         features=rng.normal(size=(n, len(rotations), n_features)).astype(np.float32),
         covariances=Y,
+        motions=np.tile([1e6, 0.0], (n, 1)),
         groups=np.array([f"world_s{k % 3}" for k in range(n)]),
         shapes={"sandwich": covariances(n, rng), "hessian": covariances(n, rng)},
         rotations_rad=np.array(rotations),
@@ -234,28 +240,31 @@ def test_pure_noise_is_within_two_percent_of_the_mean(form: str) -> None:
     config = dataclasses.replace(PAPER, theta=form, rank=4, regularization=0.03)
     training = fit(noise(400, 2), config, noise(200, 3))
     unseen = noise(300, 4)
-    F = np.array([predict(training.model, d[0]).covariance for d in unseen.features])
+    F = np.array([answer.covariance for answer in answers(training.model, unseen)])
     baseline = np.tile(noise(400, 2).covariances.mean(axis=0), (300, 1, 1))
     assert kl(unseen.covariances, F).mean() < 1.02 * kl(unseen.covariances, baseline).mean()
 
 
 @pytest.mark.parametrize("form", ["upper_triangular", "diagonal", "low_rank"])
 @pytest.mark.parametrize("shape", ["none", "hessian", "sandwich"])
-def test_the_model_predicts_as_training_judged_it(form: str, shape: str) -> None:
+@pytest.mark.parametrize("frame", ["motion", "sensor"])
+def test_the_model_predicts_as_training_judged_it(form: str, shape: str, frame: str) -> None:
     examples, validation = some(seed=0, rotations=(0.0, 0.5)), some(9, seed=1)
-    validation = dataclasses.replace(validation, groups=np.array(["v"] * 9))
+    moved = np.random.default_rng(2).normal(size=(33, 2)) * 0.05
+    examples = dataclasses.replace(examples, motions=moved[:24])
+    groups = np.array(["v"] * 9)
+    validation = dataclasses.replace(validation, groups=groups, motions=moved[24:])
     config = TrainingConfig(
-        features="descriptor", shape=shape, theta=form, rank=2, max_iterations=5, mean_weight=0.1
+        features="descriptor",
+        shape=shape,
+        frame=frame,
+        theta=form,
+        rank=2,
+        max_iterations=5,
+        mean_weight=0.1,
     )
     training = fit(examples, config, validation)
-    F = np.array(
-        [
-            predict(training.model, d[0], None if shape == "none" else S).covariance
-            for d, S in zip(
-                validation.features, validation.shapes.get(shape, [None] * 9), strict=True
-            )
-        ]
-    )
+    F = np.array([answer.covariance for answer in answers(training.model, validation)])
     divergence = kl(validation.covariances, F)
     figures = training.figures["validation"]["cello3d"]
     assert figures.kl_mean == pytest.approx(divergence.mean(), rel=1e-9)
@@ -268,6 +277,7 @@ def test_a_turned_copy_predicts_the_turned_covariance() -> None:
     config = TrainingConfig(
         features="descriptor",
         shape="sandwich",
+        frame="sensor",
         theta="diagonal",
         mean_weight=0.0,
         max_iterations=1,
@@ -319,8 +329,10 @@ def test_the_order_of_the_examples_does_not_change_predictions() -> None:
     )
     config = dataclasses.replace(PAPER, max_iterations=3)  # rounding grows from step to step
     one, two = fit(examples, config).model, fit(shuffled, config).model
-    d = np.linspace(-1, 1, 5)
-    np.testing.assert_allclose(predict(one, d).covariance, predict(two, d).covariance, rtol=1e-6)
+    d, ahead = np.linspace(-1, 1, 5), {"motion": [1.0, 0.0]}
+    np.testing.assert_allclose(
+        predict(one, d, **ahead).covariance, predict(two, d, **ahead).covariance, rtol=1e-6
+    )
 
 
 SGD = TrainingConfig(
