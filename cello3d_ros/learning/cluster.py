@@ -15,6 +15,7 @@ import asyncio
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib import import_module
 from itertools import pairwise
 from typing import Any
@@ -146,6 +147,8 @@ class _UnderWay:
             except Cello3dError as error:
                 self.error = error
                 return
+            if scan is not None:
+                scan = replace(scan, look=None)  # the world stays here
             if j in needed:
                 clouds[j] = self._submit(f"cloud-{j}", prepared, self.job, j, scan)
             for i in by_reading.get(j, []):

@@ -64,7 +64,7 @@ def test_json_holds_the_same_for_a_machine(
     assert found["path"] == str(path)
     assert found["relative_to"] == "sandwich"
     assert found["kind"] == "model file (.npz)"
-    assert found["format_version"] == 3
+    assert found["format_version"] == 4
     assert found["size_bytes"] == path.stat().st_size
     assert found["provenance"] == PROVENANCE
     assert found["sampling"] == config["sampling"]
