@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from cello3d_ros.config import PIPELINE, Config, NodeConfig
+from cello3d_ros.config import Config, NodeConfig, sections_of
 from cello3d_ros.covariance.model import load_model, shipped_model_path
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.geometry import se3
@@ -97,7 +97,7 @@ def main() -> None:
     arguments = parser.parse_args()
     recording = open_recording(arguments.recording)
     model = load_model(arguments.model)
-    pipeline = {name: getattr(model.pipeline, name) for name in PIPELINE}
+    pipeline = sections_of(model.pipeline)
 
     def tracker(**settings: Any) -> Tracker:
         config = Config(**pipeline, node=NodeConfig(**settings))

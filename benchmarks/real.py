@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cello3d_ros.config import PIPELINE, Config, NodeConfig
+from cello3d_ros.config import Config, NodeConfig, sections_of
 from cello3d_ros.covariance.lost import is_lost
 from cello3d_ros.covariance.model import Model, find_model, load_model
 from cello3d_ros.errors import Cello3dError
@@ -44,7 +44,7 @@ def sampled(path: Path, cache: Path, model: Model, arguments: argparse.Namespace
     sampling = replace(
         model.sampling, n_samples=arguments.samples, max_gap=arguments.max_gap, precision=0.0
     )
-    sections = {name: getattr(model.pipeline, name) for name in PIPELINE}
+    sections = sections_of(model.pipeline)
     config = Config(**sections, sampling=sampling)
     if path.name.startswith(EXACT):
         sample([path], folder, config, arguments.jobs)

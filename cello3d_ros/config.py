@@ -2,7 +2,8 @@
 
 The same YAML file serves the tools and, as a ROS parameter file, the node: the sections may stand
 at the top level or below ``/**: ros__parameters:``.  Every setting is a bool, int, float, str or a
-tuple of one of them, so that each is also a ROS parameter (``section.name``).
+tuple of one of them, so that each is also a ROS parameter (``section.name``).  Cloud, icp, overlap
+and grid, the pipeline, start from the one that the key ``pipeline`` names.
 """
 
 from __future__ import annotations
@@ -28,6 +29,33 @@ def _setting(
     return field(
         default=default, metadata={"doc": doc, "low": low, "high": high, "choices": choices}
     )
+
+
+def _checked(setting: dataclasses.Field[Any], value: Any, owner: str) -> Any:
+    """Return ``value`` in the type of the setting's default, or raise ConfigError."""
+    name = f"{owner}.{setting.name}"
+    default = setting.default
+    if isinstance(default, tuple):
+        if not isinstance(value, (tuple, list)):
+            raise ConfigError(f"{name} must be a list of {type(default[0]).__name__}: {value!r}")
+        return tuple(_checked_scalar(setting, item, default[0], name) for item in value)
+    return _checked_scalar(setting, value, default, name)
+
+
+def _checked_scalar(setting: dataclasses.Field[Any], value: Any, default: Any, name: str) -> Any:
+    wanted = type(default)
+    if wanted is float and type(value) is int:
+        value = float(value)
+    if type(value) is not wanted:
+        raise ConfigError(f"{name} must be of type {wanted.__name__}: {value!r}")
+    choices = setting.metadata["choices"]
+    if choices and value not in choices:
+        raise ConfigError(f"{name} must be one of {', '.join(choices)}: {value!r}")
+    low, high = setting.metadata["low"], setting.metadata["high"]
+    if wanted in (int, float) and not low <= value <= high:
+        allowed = f"at least {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
+        raise ConfigError(f"{name} must be {allowed}: {value!r}")
+    return value
 
 
 #: The covariance methods that the node, ``estimate --method`` and ``Estimator`` offer.
@@ -56,7 +84,7 @@ class CloudConfig(Section):
         0.0,
         1.0,
     )
-    voxel_m: float = _setting(0.2, "side of the cubes in which density is bounded", 1e-3)
+    voxel_m: float = _setting(0.1, "side of the cubes in which density is bounded", 1e-3)
     max_points_per_voxel: int = _setting(4, "points kept in one cube, drawn at random", 1)
     n_neighbors: int = _setting(20, "neighbours of a normal and its features", 3, 64)
     min_spread: float = _setting(
@@ -70,7 +98,7 @@ class CloudConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class IcpConfig(Section):
-    """ICP pipeline (Table I of the paper)."""
+    """ICP (Table I of the paper lists what it is made of)."""
 
     backend: str = _setting(
         "icp",
@@ -89,9 +117,9 @@ class IcpConfig(Section):
     rotation_epsilon_rad: float = _setting(1e-3, "mean rotation step that ends ICP", 0.0)
     translation_epsilon_m: float = _setting(1e-3, "mean translation step that ends ICP", 0.0)
     n_smoothed: int = _setting(3, "steps over which those means are taken", 1, 100)
-    n_reading_points: int = _setting(2000, "random subsample of the reading; 0 is all of it", 0)
+    n_reading_points: int = _setting(5000, "random subsample of the reading; 0 is all of it", 0)
     n_reference_points: int = _setting(
-        10000, "random subsample of the reference; 0 is all of it, with the tree it has", 0
+        0, "random subsample of the reference; 0 is all of it, with the tree it has", 0
     )
 
     def __post_init__(self) -> None:
@@ -379,6 +407,15 @@ class Config(Pipeline):
     node: NodeConfig = field(default_factory=NodeConfig)
 
 
+#: What a model is trained and used with: ``robot`` for robots, ``paper`` for Table I of the paper.
+PIPELINES = {
+    "robot": Pipeline(),
+    "paper": Pipeline(
+        cloud=CloudConfig(voxel_m=0.2, min_spread=0.0),
+        icp=IcpConfig(n_reading_points=2000, n_reference_points=10000),
+    ),
+}
+
 SECTIONS: dict[str, type[Any]] = {
     "cloud": CloudConfig,
     "icp": IcpConfig,
@@ -395,31 +432,46 @@ _SCATTER = ("variance", "noise_m")  # of sampling: what the registrations of a m
 S = TypeVar("S", bound=Section)
 
 
-def section_from(kind: type[S], values: dict[str, Any], where: str) -> S:
-    """Build one section from a mapping.  Raises ConfigError naming what is wrong in ``where``."""
-    known = {setting.name for setting in dataclasses.fields(kind)}  # type: ignore[arg-type]
+def named_pipeline(name: Any, where: str) -> Pipeline:
+    """Return one of ``PIPELINES``.  Raises ConfigError."""
+    if not isinstance(name, str) or name not in PIPELINES:
+        raise ConfigError(f"{where}: pipeline must be one of {', '.join(PIPELINES)}: {name!r}")
+    return PIPELINES[name]
+
+
+def pipeline_name(pipeline: Pipeline) -> str:
+    """Return the name in ``PIPELINES`` of what is the same or, ``changed``, the most alike."""
+    n_unlike = {name: len(differences(pipeline, other)) for name, other in PIPELINES.items()}
+    name = min(n_unlike, key=n_unlike.__getitem__)
+    return f"{name}, changed" if n_unlike[name] else name
+
+
+def config_from(tree: dict[str, Any], where: str = "configuration") -> Config:
+    """Build a Config from nested mappings; what is not named is that of ``pipeline`` (robot)."""
+    base = Config(**sections_of(named_pipeline(tree.get("pipeline", "robot"), where)))
+    sections = {name: values for name, values in tree.items() if name != "pipeline"}
+    if unknown := sorted(set(sections) - set(SECTIONS)):
+        raise ConfigError(
+            f"{where}: unknown section {unknown[0]!r}; known are pipeline, {', '.join(SECTIONS)}"
+        )
+    for name, values in sections.items():
+        if not isinstance(values, dict):
+            raise ConfigError(f"{where}: section {name!r} must hold settings, not {values!r}")
+        sections[name] = _section_from(getattr(base, name), values, f"{where}: {name}")
+    return dataclasses.replace(base, **sections)
+
+
+def _section_from(base: S, values: dict[str, Any], where: str) -> S:
+    """Return a section with some values set anew.  Raises ConfigError naming what is wrong."""
+    known = {setting.name for setting in dataclasses.fields(base)}  # type: ignore[arg-type]
     if unknown := sorted(set(values) - known):
         raise ConfigError(
             f"{where}: unknown setting {unknown[0]!r}; known are {', '.join(sorted(known))}"
         )
     try:
-        return kind(**values)
+        return dataclasses.replace(base, **values)  # type: ignore[type-var]
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
-
-
-def config_from(tree: dict[str, Any], where: str = "configuration") -> Config:
-    """Build a Config from nested mappings; what is not named keeps its default."""
-    if unknown := sorted(set(tree) - set(SECTIONS)):
-        raise ConfigError(
-            f"{where}: unknown section {unknown[0]!r}; known are {', '.join(SECTIONS)}"
-        )
-    sections = {}
-    for name, values in tree.items():
-        if not isinstance(values, dict):
-            raise ConfigError(f"{where}: section {name!r} must hold settings, not {values!r}")
-        sections[name] = section_from(SECTIONS[name], values, f"{where}: {name}")
-    return Config(**sections)
 
 
 def config_to(config: Pipeline) -> dict[str, dict[str, Any]]:
@@ -434,9 +486,14 @@ def config_to(config: Pipeline) -> dict[str, dict[str, Any]]:
     }
 
 
+def sections_of(config: Pipeline) -> dict[str, Any]:
+    """Return the sections from which a covariance follows, by their names."""
+    return {name: getattr(config, name) for name in PIPELINE}
+
+
 def pipeline_of(config: Pipeline) -> Pipeline:
     """Return only the sections from which a covariance follows."""
-    return Pipeline(**{name: getattr(config, name) for name in PIPELINE})
+    return Pipeline(**sections_of(config))
 
 
 def differences(ours: Pipeline, theirs: Pipeline) -> list[str]:
@@ -459,8 +516,21 @@ def differences(ours: Pipeline, theirs: Pipeline) -> list[str]:
     ]
 
 
-def load_config(path: Path | str) -> Config:
-    """Read a YAML file, plain or a ROS parameter file.  Raises ConfigError."""
+def pipeline_warning(model: Pipeline, used: Pipeline) -> str:
+    """Return what to say where a pipeline is not the one that a model was trained with, or ""."""
+    if not (found := differences(used, model)):
+        return ""
+    return (
+        f"the model was trained with the pipeline {pipeline_name(model)}, this is "
+        f"{pipeline_name(used)}: {'; '.join(found)}"
+    )
+
+
+def load_config(path: Path | str, pipeline: str = "") -> Config:
+    """Read a YAML file, plain or a ROS parameter file.  Raises ConfigError.
+
+    pipeline: one of ``PIPELINES`` in place of the file's, whose sections still win.
+    """
     try:
         with open(path, encoding="utf-8") as stream:
             tree = yaml.safe_load(stream) or {}
@@ -472,31 +542,4 @@ def load_config(path: Path | str) -> Config:
         if isinstance(value, dict) and "ros__parameters" in value:
             tree = value["ros__parameters"] or {}
             break
-    return config_from(tree, str(path))
-
-
-def _checked(setting: dataclasses.Field[Any], value: Any, owner: str) -> Any:
-    """Return ``value`` in the type of the setting's default, or raise ConfigError."""
-    name = f"{owner}.{setting.name}"
-    default = setting.default
-    if isinstance(default, tuple):
-        if not isinstance(value, (tuple, list)):
-            raise ConfigError(f"{name} must be a list of {type(default[0]).__name__}: {value!r}")
-        return tuple(_checked_scalar(setting, item, default[0], name) for item in value)
-    return _checked_scalar(setting, value, default, name)
-
-
-def _checked_scalar(setting: dataclasses.Field[Any], value: Any, default: Any, name: str) -> Any:
-    wanted = type(default)
-    if wanted is float and type(value) is int:
-        value = float(value)
-    if type(value) is not wanted:
-        raise ConfigError(f"{name} must be of type {wanted.__name__}: {value!r}")
-    choices = setting.metadata["choices"]
-    if choices and value not in choices:
-        raise ConfigError(f"{name} must be one of {', '.join(choices)}: {value!r}")
-    low, high = setting.metadata["low"], setting.metadata["high"]
-    if wanted in (int, float) and not low <= value <= high:
-        allowed = f"at least {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
-        raise ConfigError(f"{name} must be {allowed}: {value!r}")
-    return value
+    return config_from({**tree, "pipeline": pipeline} if pipeline else tree, str(path))

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cello3d_ros.config import COVARIANCE_MODES
+from cello3d_ros.cli.sources import add_pipeline_argument
+from cello3d_ros.config import COVARIANCE_MODES, PIPELINES
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.se3 import Array, is_rigid
 
@@ -33,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="cello3d",
         help="how the covariance is found; fused is experimental",
     )
+    add_pipeline_argument(parser, "the model's")
     parser.add_argument("--seed", type=int, default=0, help="of the random subsamples")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
@@ -43,7 +45,9 @@ def run(arguments: argparse.Namespace) -> None:
     from cello3d_ros.recordings.files import read_cloud
 
     T_init = _read_pose(Path(arguments.init)) if arguments.init else np.eye(4)
-    estimator = Estimator(arguments.model, arguments.method)
+    estimator = Estimator(
+        arguments.model, arguments.method, pipeline=PIPELINES.get(arguments.pipeline)
+    )
     reading, reference = read_cloud(arguments.reading), read_cloud(arguments.reference)
     found = estimator(reading, reference, T_init, arguments.seed)
     print(json.dumps(found.to_dict(), indent=2) if arguments.json else _as_text(found))

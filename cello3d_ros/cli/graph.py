@@ -7,7 +7,12 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cello3d_ros.cli.sources import add_source_arguments, open_source, with_progress
+from cello3d_ros.cli.sources import (
+    add_pipeline_argument,
+    add_source_arguments,
+    open_source,
+    with_progress,
+)
 from cello3d_ros.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -29,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model", metavar="M", default="", help="model file or name of a shipped one (general)"
     )
+    add_pipeline_argument(parser, "the model's")
     add_source_arguments(parser)
     parser.add_argument(
         "--max-gap", type=int, default=1, metavar="G", help="scans before a scan to register to"
@@ -62,6 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Register, write the graph and say what it holds."""
     from cello3d_ros.cli.align import posed
+    from cello3d_ros.config import PIPELINES
     from cello3d_ros.covariance.case import DEFAULTS
     from cello3d_ros.covariance.estimator import Estimator
     from cello3d_ros.evaluation.graph import build_graph
@@ -74,7 +81,9 @@ def run(arguments: argparse.Namespace) -> None:
     source = open_source(arguments.recording, arguments)
     recording = posed(source, poses, arguments.jobs, keeps_odometry=settings.drift is not None)
     estimator = Estimator(
-        arguments.model or "general", settings=DEFAULTS._replace(n_threads=arguments.jobs)
+        arguments.model or "general",
+        settings=DEFAULTS._replace(n_threads=arguments.jobs),
+        pipeline=PIPELINES.get(arguments.pipeline),
     )
     scans = with_progress(recording, len(recording), recording.name)
     graph = build_graph(recording, estimator, settings, scans)

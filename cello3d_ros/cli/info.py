@@ -13,7 +13,7 @@ import numpy as np
 
 from cello3d_ros.cli.recording_info import describe_recording, is_recording
 from cello3d_ros.cli.sources import add_source_arguments
-from cello3d_ros.config import PIPELINE, config_to
+from cello3d_ros.config import PIPELINE, config_to, pipeline_name
 from cello3d_ros.covariance.model import FORMAT_VERSION, SHIPPED, Model, find_model, load_model
 from cello3d_ros.errors import Cello3dError
 
@@ -103,6 +103,7 @@ def _describe_model(path: Path, _: argparse.Namespace) -> dict[str, Any]:
         "looks_at": model.features,
         "mean_weight": model.mean_weight,
         "margin": model.margin,
+        "pipeline_name": pipeline_name(model.pipeline),
         "prior_variance": model.sampling.variance,
         **_mean_sigmas(model),
         **_lost(model),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
@@ -11,7 +12,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cello3d_ros.cli.sources import add_source_arguments, in_words, open_source, with_progress
+from cello3d_ros.cli.sources import (
+    add_pipeline_argument,
+    add_source_arguments,
+    in_words,
+    open_source,
+    with_progress,
+)
 from cello3d_ros.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -35,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--config", metavar="FILE", type=Path, help="YAML settings, of which 'node' counts"
     )
+    add_pipeline_argument(parser, "the model's")
     add_source_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
 
@@ -44,7 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     Raises Cello3dError; RecordingError when no pair was answered.
     """
-    from cello3d_ros.config import PIPELINE, Config, NodeConfig, load_config
+    from cello3d_ros.config import PIPELINES, Config, NodeConfig, load_config, pipeline_warning
     from cello3d_ros.covariance.model import load_model
     from cello3d_ros.recordings.start_poses import PosesAsOdometry
     from cello3d_ros.tracking.offline import replay
@@ -58,8 +66,10 @@ def run(arguments: argparse.Namespace) -> None:
         recording = PosesAsOdometry(recording)
     node = replace(node, T_base_sensor=_extrinsic(recording, arguments.extrinsic))
     model = load_model(arguments.model)
-    config = Config(**{name: getattr(model.pipeline, name) for name in PIPELINE}, node=node)
-    tracker = Tracker(model, config, node)
+    pipeline = PIPELINES.get(arguments.pipeline, model.pipeline)
+    if warning := pipeline_warning(model.pipeline, pipeline):
+        print(f"cello3d: {warning}", file=sys.stderr)
+    tracker = Tracker(model, pipeline, node)
     steps = replay(recording, tracker, node)
     counts = write_answers(
         arguments.out, with_progress(steps, recording.n_declared, recording.name), node

@@ -12,7 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cello3d_ros.config import Config, SamplingConfig, load_config, pipeline_of
+from cello3d_ros.cli.sources import add_pipeline_argument
+from cello3d_ros.config import Config, SamplingConfig, config_from, load_config, pipeline_of
 from cello3d_ros.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", required=True, metavar="DATASET", help="folder to write or resume"
     )
     parser.add_argument("--config", metavar="FILE", help="YAML settings; flags below win")
+    add_pipeline_argument(parser, "robot or what the settings name")
     parser.add_argument(
         "--samples",
         type=_samples,
@@ -75,7 +77,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Sample what is missing; the same command finishes what was interrupted."""
     from cello3d_ros.learning.sample import sample
 
-    config = load_config(arguments.config) if arguments.config else Config()
+    config = _config(arguments)
     config = replace(config, sampling=_sampling(config, arguments))
     recordings = arguments.recordings
     if arguments.poses == "joint":
@@ -143,6 +145,13 @@ def progress_bar() -> Iterator[Callable[[Status], None]]:
             bar.update(status.n_registrations - bar.n)
 
         yield show
+
+
+def _config(arguments: argparse.Namespace) -> Config:
+    """Return the settings of the pipeline and the file that were named."""
+    if arguments.config:
+        return load_config(arguments.config, arguments.pipeline)
+    return config_from({"pipeline": arguments.pipeline or "robot"})
 
 
 def _sampling(config: Config, arguments: argparse.Namespace) -> SamplingConfig:

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cello3d_ros.config import PIPELINES
 from cello3d_ros.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -57,6 +58,16 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
         "--strict",
         action="store_true",
         help="refuse a recording for one message that cannot be read; else it is left out",
+    )
+
+
+def add_pipeline_argument(parser: argparse.ArgumentParser, default: str) -> None:
+    """Declare the option that names a pipeline; default: where the settings are from without."""
+    parser.add_argument(
+        "--pipeline",
+        choices=tuple(PIPELINES),
+        default="",
+        help=f"settings of clouds and ICP, in place of {default}",
     )
 
 

@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Align, sample, tune and say what came of it; goes on where it was interrupted."""
     from cello3d_ros.cli.align import joint
     from cello3d_ros.cli.sample import progress_bar
-    from cello3d_ros.config import PIPELINE, Config
+    from cello3d_ros.config import Config, sections_of
     from cello3d_ros.covariance.model import find_model, load_model, save_model
     from cello3d_ros.learning.dataset import open_dataset
     from cello3d_ros.learning.sample import sample
@@ -62,8 +62,7 @@ def run(arguments: argparse.Namespace) -> None:
     sampling = replace(
         model.sampling, precision=0.0, **{k: v for k, v in wanted.items() if v is not None}
     )
-    sections = {name: getattr(model.pipeline, name) for name in PIPELINE}
-    config = Config(**sections, sampling=sampling)
+    config = Config(**sections_of(model.pipeline), sampling=sampling)
     recordings = [arguments.recording]
     if arguments.poses == "joint":
         recordings = joint(recordings, folder, config, arguments.jobs)

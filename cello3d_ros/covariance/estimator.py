@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cello3d_ros.clouds.shape import Cloud, filtered, with_shape
-from cello3d_ros.config import Pipeline
+from cello3d_ros.config import Pipeline, pipeline_warning
 from cello3d_ros.covariance.case import DEFAULTS, Case, MethodSettings
 from cello3d_ros.covariance.closed_form import free_error
 from cello3d_ros.covariance.description import describe
@@ -143,13 +145,16 @@ class Estimator:
         """Keep what every pair is judged by.
 
         model: also a file or a shipped model's name; method: a name of ``METHODS``; pipeline: the
-        model's, unless another is given.  Raises ModelError, ConfigError.
+        model's, unless another is given, of which a warning is logged.  Raises ModelError,
+        ConfigError.
         """
         if method not in METHODS:
             raise ConfigError(f"method must be one of {', '.join(METHODS)}: {method!r}")
         self.model = model if isinstance(model, Model) else load_model(model)
         self.method, self.settings = method, settings
         self.pipeline = self.model.pipeline if pipeline is None else pipeline
+        if warning := pipeline_warning(self.model.pipeline, self.pipeline):
+            _warn_once(warning)
 
     def __call__(
         self,
@@ -282,6 +287,11 @@ def needs_shape(model: Model, pipeline: Pipeline) -> bool:
 def registered_elsewhere(T_ref_read: Array) -> Registration:
     """Return a pose that another program found as a registration of which no more is known."""
     return Registration(np.array(T_ref_read, np.float64, order="C"), 0, True, "", float("nan"), 0)
+
+
+@functools.cache
+def _warn_once(sentence: str) -> None:
+    logging.getLogger("cello3d_ros").warning(sentence)
 
 
 def _looks_at_descriptor(model: Model) -> bool:

@@ -29,6 +29,7 @@ from cello3d_ros.config import (
     config_from,
     config_to,
     pipeline_of,
+    sections_of,
 )
 from cello3d_ros.covariance.archive import read_arrays, write_arrays
 from cello3d_ros.covariance.features import KINDS
@@ -284,8 +285,7 @@ def find_model(word: str | Path) -> Path:
 
 
 def _header(model: Model) -> dict[str, Any]:
-    sections = {name: getattr(model.pipeline, name) for name in PIPELINE}
-    config = config_to(Config(**sections, sampling=model.sampling))
+    config = config_to(Config(**sections_of(model.pipeline), sampling=model.sampling))
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,

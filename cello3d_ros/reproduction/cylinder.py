@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.shape import Cloud
-from cello3d_ros.config import IcpConfig, Pipeline
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array, exp, transform
 from cello3d_ros.reproduction import drawing
+from cello3d_ros.reproduction.datasets import PAPER
 from cello3d_ros.reproduction.result import Result, listing
 from cello3d_ros.reproduction.scenes import cylinder, errors, kept_of
 
@@ -21,7 +22,8 @@ _UPSIDE_DOWN_RAD = 3.0
 
 def make(n_samples: int, n_threads: int, seed: int) -> Result:
     """Register from starts wide enough to turn the cylinder over, and cluster the results."""
-    pipeline = Pipeline(icp=IcpConfig(n_reading_points=500, n_reference_points=1500))
+    icp = replace(PAPER.icp, n_reading_points=500, n_reference_points=1500)
+    pipeline = replace(PAPER, icp=icp)
     rng = np.random.default_rng([seed, 4])
     reading, reference = (cylinder(rng, 10_000, 0.01) for _ in range(2))
     starts = rng.normal(size=(n_samples, 6)) * _DEVIATIONS

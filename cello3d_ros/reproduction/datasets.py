@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from cello3d_ros.config import CloudConfig, IcpConfig, Pipeline, SamplingConfig
+from cello3d_ros.config import PIPELINES, SamplingConfig
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.learning.dataset import Dataset, open_dataset
 from cello3d_ros.learning.sampling import pairs, sample_recording
@@ -16,10 +16,7 @@ from cello3d_ros.recordings.challenging import is_challenging, sequence_of
 from cello3d_ros.reproduction.costs import Costs
 from cello3d_ros.reproduction.sequences import SEQUENCES, counterpart
 
-PAPER = Pipeline(
-    cloud=CloudConfig(min_spread=0.0),
-    icp=IcpConfig(n_reading_points=2000, n_reference_points=10000),
-)
+PAPER = PIPELINES["paper"]
 _N_TURNS = 7  # of each pair about z
 
 Recordings = Mapping[str, Recording]  # by the key of their sequence

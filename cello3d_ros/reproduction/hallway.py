@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.shape import Cloud
-from cello3d_ros.config import Pipeline
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.reproduction import drawing
+from cello3d_ros.reproduction.datasets import PAPER
 from cello3d_ros.reproduction.result import Result, listing
 from cello3d_ros.reproduction.scenes import errors, hallway, kept_of
 
@@ -24,7 +24,7 @@ def make(n_samples: int, n_threads: int, seed: int) -> Result:
     rng = np.random.default_rng([seed, 5])
     reading, reference = (hallway(rng, 6000, 0.01, _PITCH_M) for _ in range(2))
     starts = rng.normal(size=(n_samples, 6)) * _DEVIATIONS
-    xi = errors(reading, reference, starts, Pipeline(), n_threads, seed)
+    xi = errors(reading, reference, starts, PAPER, n_threads, seed)
     kept = kept_of(xi)
     Y, Y_kept = sampled_covariance(xi), sampled_covariance(xi[kept])
     pillar = np.round(xi[:, 0] / _PITCH_M).astype(int)

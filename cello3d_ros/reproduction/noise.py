@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from cello3d_ros.config import Pipeline, SamplingConfig
+from cello3d_ros.config import SamplingConfig
 from cello3d_ros.evaluation.online import prepared
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.sampling import sample_recording
 from cello3d_ros.reproduction import drawing
+from cello3d_ros.reproduction.datasets import PAPER
 from cello3d_ros.reproduction.result import Result, markdown_table
 from cello3d_ros.reproduction.scenes import censi_of, cube, errors
 from cello3d_ros.reproduction.sequences import counterpart
@@ -46,24 +47,23 @@ def make(n_samples: int, n_threads: int, seed: int) -> Result:
 
 
 def _cube(sigma_m: float, n_samples: int, n_threads: int, seed: int) -> tuple[Array, Array]:
-    pipeline, found = Pipeline(), []
+    found = []
     for k in range(n_samples):
         rng = np.random.default_rng([seed, 3, k])  # the same points and starts at each noise
         reading, reference = (cube(rng, _N_POINTS, sigma_m) for _ in range(2))
         start = rng.normal(scale=0.05, size=(1, 6))
-        found.append(errors(reading, reference, start, pipeline, n_threads, seed))
-    C = censi_of(reading, reference, np.eye(4), pipeline, sigma_m)
+        found.append(errors(reading, reference, start, PAPER, n_threads, seed))
+    C = censi_of(reading, reference, np.eye(4), PAPER, sigma_m)
     return sampled_covariance(np.concatenate(found)), C
 
 
 def _apartment(sigma_m: float, n_samples: int, n_threads: int, seed: int) -> tuple[Array, Array]:
-    pipeline = Pipeline()
     recording = counterpart("apartment", 0, 2)
     recording = replace(recording, scanner=replace(recording.scanner, range_noise_m=sigma_m))
     sampling = SamplingConfig(n_samples=n_samples, seed=seed)
-    (record,) = sample_recording(recording, [(0, 1)], pipeline, sampling, n_threads)
-    clouds, _ = prepared(recording, pipeline, [0, 1], seed)
-    C = censi_of(clouds[1], clouds[0], record.T_mean, pipeline, sigma_m)
+    (record,) = sample_recording(recording, [(0, 1)], PAPER, sampling, n_threads)
+    clouds, _ = prepared(recording, PAPER, [0, 1], seed)
+    C = censi_of(clouds[1], clouds[0], record.T_mean, PAPER, sigma_m)
     return sampled_covariance(record.xi[record.kept]), C
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from cello3d_ros.config import IcpConfig, Pipeline
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.reproduction import drawing
+from cello3d_ros.reproduction.datasets import PAPER
 from cello3d_ros.reproduction.result import Result
 from cello3d_ros.reproduction.scenes import censi_of, cube, errors
 
@@ -23,7 +25,8 @@ _N_GRID = 81
 
 def make(n_samples: int, n_threads: int, seed: int) -> Result:
     """Evaluate the objective on three grids and sample ICP with new noise each time."""
-    pipeline = Pipeline(icp=IcpConfig(n_reading_points=_N_POINTS, n_reference_points=_N_POINTS))
+    icp = replace(PAPER.icp, n_reading_points=_N_POINTS, n_reference_points=_N_POINTS)
+    pipeline = replace(PAPER, icp=icp)
     rng = np.random.default_rng([seed, 1])
     reading, reference = (cube(rng, _N_POINTS, SIGMA_M) for _ in range(2))
     xi = _sampled(n_samples, pipeline, n_threads, seed)

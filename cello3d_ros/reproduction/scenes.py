@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.clouds.shape import Cloud, prepare
-from cello3d_ros.config import CloudConfig, Pipeline, SamplingConfig
+from cello3d_ros.config import Pipeline, SamplingConfig
 from cello3d_ros.covariance.closed_form import censi
 from cello3d_ros.geometry.se3 import Array, exp, log
 from cello3d_ros.learning.clustering import nearest_cluster
 from cello3d_ros.registration.icp import register_many
 from cello3d_ros.registration.overlap import find_overlap
+from cello3d_ros.reproduction.datasets import PAPER
 
-_EVERY_POINT = CloudConfig(min_range_m=0.0, max_points_per_voxel=1_000_000)
+_EVERY_POINT = replace(PAPER.cloud, min_range_m=0.0, max_points_per_voxel=1_000_000)
 
 
 def cube(rng: np.random.Generator, n: int, sigma_m: float, side_m: float = 1.0) -> Cloud:

@@ -31,7 +31,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
-from cello3d_ros.config import PIPELINE, Config, differences
+from cello3d_ros.config import Config, named_pipeline, pipeline_warning, sections_of
 from cello3d_ros.covariance.model import Model, find_model, load_model
 from cello3d_ros.errors import Cello3dError, ConfigError
 from cello3d_ros.ros import parameters
@@ -138,7 +138,9 @@ class CovarianceNode(ManagedNode):
     def _declared(self, model: Model) -> Config:
         if self._defaults is not None:
             parameters.release(self, self._defaults)
-        self._defaults = config_of(model)
+        name = self.get_parameter(parameters.PIPELINE_NAME).value
+        pipeline = named_pipeline(name, "parameters") if name else model.pipeline
+        self._defaults = Config(**sections_of(pipeline), sampling=model.sampling)
         config = parameters.declare(self, self._defaults)
         if config.grid != model.pipeline.grid:
             raise ConfigError(f"parameters grid.* must be the model's, {model.pipeline.grid}")
@@ -334,11 +336,5 @@ class CovarianceNode(ManagedNode):
         self._warn_of_differences(self._config, self._model)
 
     def _warn_of_differences(self, config: Config, model: Model) -> None:
-        for difference in differences(config, config_of(model)):
-            self.get_logger().warning(f"not as the model was trained: {difference}")
-
-
-def config_of(model: Model) -> Config:
-    """Return the settings that a model was trained with, and the defaults of all others."""
-    sections = {name: getattr(model.pipeline, name) for name in PIPELINE}
-    return Config(**sections, sampling=model.sampling)
+        if warning := pipeline_warning(model.pipeline, config):
+            self.get_logger().warning(warning)

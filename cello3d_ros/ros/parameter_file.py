@@ -17,9 +17,11 @@ _HEAD = """\
 # Settings of cello3d_ros, each at its default: a ROS parameter file, read by the tools as well.
 #   ros2 run cello3d_ros covariance_node --ros-args --params-file cello3d.yaml
 # Numbers with a decimal point must keep it.  The node takes cloud, icp, overlap and grid from its
-# model unless they stand here: leave out what stays as it is.
+# model unless they, or the name of a pipeline, stand here: leave out what stays as it is.
 /**:
   ros__parameters:
+    # what cloud, icp, overlap and grid start from: robot, or paper for Table I of the paper
+    pipeline: "robot"
 """
 
 

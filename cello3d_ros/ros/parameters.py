@@ -12,26 +12,36 @@ from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from cello3d_ros.config import PIPELINE, SECTIONS, Config, IcpConfig
+from cello3d_ros.config import PIPELINE, PIPELINES, SECTIONS, Config, IcpConfig
 from cello3d_ros.errors import ConfigError
 from cello3d_ros.registration.backends import check_installed
 
-MODEL, AUTOSTART = "node.model", "node.autostart"
+MODEL, AUTOSTART, PIPELINE_NAME = "node.model", "node.autostart", "pipeline"
 T_BASE_SENSOR = "node.T_base_sensor"
 
 _SECTIONS = {name: SECTIONS[name] for name in (*PIPELINE, "node")}  # others are the tools'
-_FIXED = {"cloud", "grid"}  # sections read once, by configure
+_FIXED = {PIPELINE_NAME, "cloud", "grid"}  # sections read once, by configure
 _FIXED_SETTINGS = {
     *(MODEL, AUTOSTART),
     *(T_BASE_SENSOR, "node.odometry_buffer_s", "node.seed"),
     *("node.pairing", "node.registration", "node.use_tf", "node.publish_tf", "node.points_type"),
 }
 _ELSEWHERE = {"sampling", "training", "qos_overrides"}  # read by the tools, and by ROS
+_PIPELINE_FIELD: Any = dataclasses.field(
+    default="",
+    metadata={
+        "doc": "where cloud, icp, overlap and grid are from; empty is the model's pipeline",
+        "low": -math.inf,
+        "high": math.inf,
+        "choices": tuple(PIPELINES),
+    },
+)
 _INT64 = 2**63 - 1
 
 
 def declare_first(node: Node) -> None:
     """Declare what is needed to configure: the defaults of the others come from the model."""
+    _declare(node, PIPELINE_NAME, _PIPELINE_FIELD, "")
     for field in dataclasses.fields(_SECTIONS["node"]):
         if (name := f"node.{field.name}") in (MODEL, AUTOSTART):
             _declare(node, name, field, field.default)

@@ -379,7 +379,9 @@ def estimator_of(model: Model, pipeline: Pipeline, config: NodeConfig) -> Estima
         ceiling=config.ceiling,
         n_threads=_N_THREADS,
     )
-    return Estimator(model, config.covariance_mode, settings, pipeline)
+    estimator = Estimator(model, config.covariance_mode, settings)
+    estimator.pipeline = pipeline  # of which whoever chose it has warned
+    return estimator
 
 
 def _broken(before: Place, now: Place) -> str:

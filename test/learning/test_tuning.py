@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cello3d_ros.config import PIPELINE, Config
+from cello3d_ros.config import Config, sections_of
 from cello3d_ros.covariance.model import Model, find_model, load_model
 from cello3d_ros.geometry.se3 import exp, inverse, transform
 from cello3d_ros.learning import tune as tuning
@@ -37,7 +37,7 @@ def dataset(general: Model, tmp_path_factory: pytest.TempPathFactory) -> Dataset
         T = T @ step
     write_folder(folder / "walk", scans, ".npy")
     sampling = replace(general.sampling, precision=0.0, n_samples=60, max_gap=2)
-    sections = {name: getattr(general.pipeline, name) for name in PIPELINE}
+    sections = sections_of(general.pipeline)
     config = Config(**sections, sampling=sampling)
     sample([open_recording(folder / "walk")], folder / "dataset", config, 1)
     return open_dataset(folder / "dataset")

@@ -80,7 +80,7 @@ def test_a_whole_life(
     model.write_bytes(whole)
     assert change("cloud.voxel_m", 0.25).successful
     assert go(Transition.TRANSITION_CONFIGURE) == (True, INACTIVE)
-    assert "not as the model was trained: cloud.voxel_m is 0.25, not 0.2" in node.output()
+    assert "robot, this is robot, changed: cloud.voxel_m is 0.25, not 0.1" in node.output()
     assert go(Transition.TRANSITION_ACTIVATE) == (True, ACTIVE)
     robot.reconnect()
     assert robot.walk()["last_event"] == "reference"

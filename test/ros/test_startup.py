@@ -81,7 +81,7 @@ def test_a_signal_ends_a_running_node_with_status_0(
         assert process.wait() == 0
         output = process.output()
     assert "unknown parameter icp.trim has no effect" in output
-    assert "not as the model was trained: icp.trim_ratio is 0.8, not 0.7" in output
+    assert "pipeline robot, this is robot, changed: icp.trim_ratio is 0.8, not 0.7" in output
     assert "Traceback" not in output
 
 
