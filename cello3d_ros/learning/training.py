@@ -49,7 +49,7 @@ Progress = Callable[[int, float, float], None]  # iteration, training loss, what
 _LEVELS = np.linspace(0.0, 1.0, 101)  # of the quantiles that a model keeps
 _PATIENCE = 20  # iterations without a better validation loss that end training
 _DIVERGED = 1e100  # |Theta|^2, far beyond anything and far below where numbers end
-_BATCH = 16  # targets of one stochastic gradient
+_BATCH = 64  # targets of one stochastic gradient
 _LOST_QUANTILE = 0.97  # of the pairs' sandwiches; decision 11
 _FEWEST_LOST = 30  # registrations in other minima that make a covariance
 

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from cello3d_ros.cli.main import main
+from cello3d_ros.config import load_config
 from cello3d_ros.covariance.model import load_model
 from cello3d_ros.geometry.se3 import Array, exp, inverse, transform
 from cello3d_ros.reproduction import models
 from cello3d_ros.reproduction.datasets import simulated
+from cello3d_ros.reproduction.readings import READINGS
 from cello3d_ros.reproduction.sequences import SEQUENCES
+from cello3d_ros.ros.process import shared_file
 
 N_SCANS = 4
 
@@ -104,6 +107,20 @@ def test_tables_on_the_papers_own_format(
     assert again["cpu_s"] > 0.5 * found["cpu_s"]  # sampling that was kept still counts
 
 
+def test_readings_of_the_training_on_the_papers_own_format(data: Path, out: Path) -> None:
+    assert reproduce("readings", out, "--data", data, "--samples", 50) == 0
+    found = json.loads((out / "readings-recorded.json").read_text())["sequences"]
+    assert list(found) == ["gazebo_summer", "gazebo_winter"]
+    for row in found.values():
+        assert list(row) == [reading.title for reading in READINGS]
+        assert all(1.0 <= reading["n_neighbors"] <= 42.0 + 1e-9 for reading in row.values())
+        printed = row[READINGS[0].title]  # hardly moves from where all weights are equal
+        assert printed["n_neighbors"] > 40.0
+        assert printed["figures"]["kl_ratio"] == pytest.approx(1.0, abs=0.05)
+    page = (out / "page" / "results.md").read_text()
+    assert "| the paper | 0.95 | 0.93 | 0.94 |" in page
+
+
 def test_odometry_on_the_papers_own_format(data: Path, out: Path) -> None:
     words = ("--data", data, "--samples", 50)
     assert reproduce("table2", out, *words, "--runs", 3) == 0
@@ -131,7 +148,11 @@ def test_odometry_on_the_papers_own_format(data: Path, out: Path) -> None:
 @pytest.mark.parametrize(
     ("what", "words", "reason"),
     [
-        ("fig-noise", ("--data", "{data}"), "--data is for table1, table2, fig-trajectories"),
+        (
+            "fig-noise",
+            ("--data", "{data}"),
+            "--data is for table1, table2, readings, fig-trajectories",
+        ),
         ("table1", ("--data", "{tmp}"), "holds none of the 'Challenging data sets'"),
         ("table1", ("--data", "/nowhere"), "/nowhere: no such folder"),
         ("table1", ("--data", "{one}"), "no sequence is there with what the paper trained it on"),
@@ -182,6 +203,10 @@ def test_sequences_are_trained_and_tested_apart() -> None:
     assert all(key not in s.trained_on for key, s in SEQUENCES.items())
     ratios = [round(s.kl_ours / s.kl_baseline, 2) for s in SEQUENCES.values()]
     assert ratios == [0.78, 0.79, 0.8, 0.95, 0.93, 0.87, 0.83]  # as the paper's Table I has them
+
+
+def test_the_settings_that_are_shipped_train_the_papers_model() -> None:
+    assert load_config(shared_file("config", "paper_training.yaml")).training == models.MEANT
 
 
 def test_the_page_is_in_the_folder_of_the_results_also_in_a_checkout(
