@@ -278,14 +278,18 @@ class PairingConfig(Section):
     """What a scan is registered to, and when an answer is none."""
 
     pairing: str = _setting(
-        "consecutive",
-        "what a cloud is registered to: the last that moved, a keyframe or reference_points",
-        choices=("consecutive", "keyframe", "topics"),
+        "keyframe",
+        "what a cloud is registered to: a keyframe, the last that moved or reference_points",
+        choices=("keyframe", "consecutive", "topics"),
     )
-    keyframe_distance_m: float = _setting(1.0, "distance that makes a new keyframe", 0.0)
+    keyframe_distance_ratio: float = _setting(
+        0.15,
+        "distance that makes a new keyframe, relative to the median range of its points",
+        0.0,
+    )
     keyframe_angle_rad: float = _setting(0.35, "rotation that makes a new keyframe", 0.0)
     keyframe_min_overlap: float = _setting(
-        0.6, "overlap below which a new keyframe is made", 0.0, 1.0
+        0.5, "overlap below which a new keyframe is made", 0.0, 1.0
     )
     reference_range_m: float = _setting(
         60.0, "points of reference_points used around the sensor", 1.0, 1e4

@@ -17,7 +17,9 @@ from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.evaluation.result import Consistency, Distances, Paths
 from cello3d_ros.geometry.gaussian import (
+    Chained,
     GaussianPose,
+    bias_kept,
     extended,
     mahalanobis,
 )
@@ -114,9 +116,10 @@ def compound_chain(steps: Sequence[GaussianPose]) -> GaussianPose:
 
 def compound_path(steps: Sequence[GaussianPose]) -> list[GaussianPose]:
     """Return the pose after each step, right covariance (``extended``)."""
-    path = [steps[0]]
-    for step in steps[1:]:
-        path.append(extended(path[-1], step))
+    chain, path = Chained.start(np.eye(4)), []
+    for step in steps:
+        chain = extended(chain, step, bias_kept(step.T))
+        path.append(chain.pose)
     return path
 
 

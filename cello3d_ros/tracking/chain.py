@@ -10,7 +10,7 @@ from cello3d_ros.clouds.motion import undistorted
 from cello3d_ros.clouds.shape import Cloud, filtered, with_shape
 from cello3d_ros.config import CloudConfig
 from cello3d_ros.geometry import se3
-from cello3d_ros.geometry.gaussian import GaussianPose
+from cello3d_ros.geometry.gaussian import Chained
 from cello3d_ros.geometry.motion import Motion
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.tracking.guess import Place
@@ -53,13 +53,13 @@ class Link:
     """A scan of a chain and its accumulated pose, with its right covariance."""
 
     frame: Frame
-    pose: GaussianPose
+    pose: Chained
 
     @classmethod
     def first(cls, frame: Frame, T_predicted: Array) -> Link:
         """Return the start of a chain, where odometry puts it or, without it, as predicted."""
         T = T_predicted if frame.T_odom_sensor is None else frame.T_odom_sensor
-        return cls(frame, GaussianPose(T, np.zeros((6, 6))))
+        return cls(frame, Chained.start(T))
 
 
 class Chain:

@@ -8,7 +8,7 @@ from cello3d_ros.config import CloudConfig, PairingConfig
 from cello3d_ros.covariance.estimator import Estimate
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.geometry import se3
-from cello3d_ros.geometry.gaussian import GaussianPose, mahalanobis
+from cello3d_ros.geometry.gaussian import Chained, mahalanobis
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.tracking.chain import Chain, Frame, Link
 from cello3d_ros.tracking.guess import ODOMETRY
@@ -33,6 +33,7 @@ class Consecutive:
     map_frame = ""  # the frame that answers are in where the reference is a map
     needs_chain = True  # whether a pause or a break of the odometry leaves nothing to register to
     knows_odometry = True  # whether odometry says where the scan is, seen from the reference
+    adds_each_step = True  # whether each scan in motion is the next reference
 
     def __init__(self) -> None:
         self._reference: Link | None = None
@@ -54,20 +55,25 @@ class Consecutive:
 
     def accept(self, link: Link, found: Estimate, config: PairingConfig) -> None:
         """Note an answered scan; one that has moved is the next reference."""
-        if has_moved(found) or makes_keyframe(found, config):
+        if has_moved(found) or self._is_far(found, config):
             self._reference = link
 
     def fail(self, chain: Chain) -> None:
         """Note a scan that did not fit."""
         self._reference = chain.newest
 
+    def _is_far(self, found: Estimate, config: PairingConfig) -> bool:
+        return self._reference is None or makes_keyframe(found, self._reference.frame, config)
+
 
 class Keyframe(Consecutive):
     """Each scan is registered to a keyframe, until it is far from it or did not fit it."""
 
+    adds_each_step = False
+
     def accept(self, link: Link, found: Estimate, config: PairingConfig) -> None:
         """Note an answered scan; one far enough from the keyframe is the next keyframe."""
-        if makes_keyframe(found, config):
+        if self._is_far(found, config):
             self._reference = link
 
 
@@ -118,7 +124,7 @@ class ToMap(Consecutive):
         cloud, T_map_crop = self._map.around(T_map_sensor[:3, 3], config, clouds)
         T_odom_crop = se3.inverse(T_map_odom) @ T_map_crop
         crop = Frame(self._map.stamp_ns, cloud, frame.place, T_odom_crop)
-        return Link(crop, GaussianPose(T_map_crop, np.zeros((6, 6))))
+        return Link(crop, Chained.start(T_map_crop))
 
     def accept(self, link: Link, found: Estimate, config: PairingConfig) -> None:
         """Note where an answered scan puts the odometry in the map."""
@@ -144,12 +150,16 @@ def has_moved(found: Estimate) -> bool:
     return bool(distance > _MOVED * np.sqrt(6.0))
 
 
-def makes_keyframe(found: Estimate, config: PairingConfig) -> bool:
-    """Return whether a registered scan is far enough from its keyframe to be the next one."""
+def makes_keyframe(found: Estimate, reference: Frame, config: PairingConfig) -> bool:
+    """Return whether a registered scan is far enough from its reference to be the next one.
+
+    Distance is relative to the median range of the reference's points: it scales with the scene.
+    """
     way_m = np.linalg.norm(found.T_ref_read[:3, 3])
     angle_rad = np.linalg.norm(se3.log(found.T_ref_read)[3:])
+    range_m = np.median(np.linalg.norm(reference.cloud.points, axis=1))
     return bool(
-        way_m > config.keyframe_distance_m
+        way_m > config.keyframe_distance_ratio * range_m
         or angle_rad > config.keyframe_angle_rad
         or found.overlap_ratio < config.keyframe_min_overlap
     )

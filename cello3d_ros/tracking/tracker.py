@@ -19,7 +19,15 @@ from cello3d_ros.covariance.case import MethodSettings
 from cello3d_ros.covariance.estimator import Estimate, Estimator, draws, needs_shape
 from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import ModelError, RegistrationError
-from cello3d_ros.geometry.gaussian import GaussianPose, extended, to_left
+from cello3d_ros.geometry.gaussian import (
+    REFERENCE_SHARE,
+    Chained,
+    GaussianPose,
+    between,
+    bias_kept,
+    extended,
+    inflation,
+)
 from cello3d_ros.geometry.motion import Motion
 from cello3d_ros.geometry.se3 import Array, inverse, log
 from cello3d_ros.geometry.transforms import seen_from_base
@@ -33,7 +41,7 @@ from cello3d_ros.tracking.chain import Chain, Frame, Link
 from cello3d_ros.tracking.external import checked
 from cello3d_ros.tracking.guess import CONSTANT_VELOCITY, EXTERNAL, ODOMETRY, Place
 from cello3d_ros.tracking.map import Map
-from cello3d_ros.tracking.pairing import PAIRINGS, ToMap
+from cello3d_ros.tracking.pairing import PAIRINGS, ToMap, has_moved
 from cello3d_ros.tracking.planar import on_the_floor
 
 _ORIGIN = np.eye(4)
@@ -165,10 +173,10 @@ class Tracker:
             self.reset("two scans fit each other but not the first of the chain")
             self._begin(rival)
             found, reference = match, rival
-        pose = extended(reference.pose, found.step)
+        pose = extended(reference.pose, found.step, bias_kept(found.step.T))
         found = self._with_motion(frame, found, reference)
         self._accept(frame, found, reference, pose)
-        return replace(self._published(frame, found, reference, pose), deskewed=deskewed)
+        return replace(self._published(frame, found, reference, pose.pose), deskewed=deskewed)
 
     def finish(self) -> None:
         """Work ahead: find the local shape of the reference, which the next scan will need.
@@ -283,7 +291,8 @@ class Tracker:
         """Return a registration with the motion since the scan before, where that is known.
 
         Where both have been registered to one scan it is the difference of the two, in which what
-        they share cancels; its covariance is that of two that share nothing, hence not too small.
+        they share cancels.  Where each scan is the next reference, the covariance holds for the
+        sum of many, taken as independent, and is wider than that of one.
         """
         newest, before, step = self._chain.newest, self._before, found.step
         self._before = reference, step
@@ -292,8 +301,9 @@ class Tracker:
         if newest.frame is not reference.frame:
             if before is None or before[0] is not reference:
                 return found
-            T = inverse(before[1].T) @ step.T
-            step = GaussianPose(T, step.Y + to_left(inverse(T), before[1].Y))
+            step = between(before[1], step, REFERENCE_SHARE)
+        elif self._pairing.adds_each_step and has_moved(found.estimate):
+            step = GaussianPose(step.T, inflation(bias_kept(step.T)) * step.Y)
         span_s = 1e-9 * (frame.stamp_ns - newest.frame.stamp_ns)
         if not 0.0 < span_s <= self.config.max_pair_gap_s:
             return found
@@ -302,7 +312,7 @@ class Tracker:
             step = seen_from_base(*step, *extrinsics)
         return found._replace(motion=step, span_s=span_s)
 
-    def _accept(self, frame: Frame, found: _Found, reference: Link, pose: GaussianPose) -> None:
+    def _accept(self, frame: Frame, found: _Found, reference: Link, pose: Chained) -> None:
         """Take an answered scan into the chain, and as the next reference if it is one."""
         T_odom_ref = reference.frame.T_odom_sensor
         if frame.place.guess not in (ODOMETRY, EXTERNAL) and T_odom_ref is not None:

@@ -8,6 +8,7 @@ import pytest
 from cello3d_ros.geometry import gaussian as g
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import (
+    Chained,
     GaussianPose,
     extended,
     is_positive_definite,
@@ -406,7 +407,7 @@ def test_a_long_chain_covers_sampled_chains(motion: list[float], turn_rad: float
     """
     rng = np.random.default_rng(0)
     step = GaussianPose(se3.exp(motion), np.diag(np.repeat([0.02**2, turn_rad**2], 3)))
-    chain, T_true, n = GaussianPose(np.eye(4), np.zeros((6, 6))), np.eye(4), 4000
+    chain, T_true, n = Chained.start(np.eye(4)), np.eye(4), 4000
     T = np.tile(np.eye(4), (n, 1, 1))
     for _ in range(80):
         chain, T_true = extended(chain, step), T_true @ step.T
@@ -419,8 +420,102 @@ def test_a_long_chain_covers_sampled_chains(motion: list[float], turn_rad: float
 
 @pytest.mark.parametrize("scale", [1e-6, 0.3, 1.0, 1e3, 1e12])
 def test_a_chain_stays_finite_and_never_knows_more_than_its_steps_together(scale: float) -> None:
-    chain = GaussianPose(np.eye(4), np.zeros((6, 6)))
+    chain = Chained.start(np.eye(4))
     for _ in range(400):
         chain = extended(chain, GaussianPose(np.eye(4), scale * np.eye(6)))
     assert is_positive_definite(chain.Y)
     assert min(399 * scale, 0.99e12) < chain.Y[0, 0] <= 1.01e12
+
+
+def chained(steps: list[GaussianPose], kept: float) -> Chained:
+    chain = Chained.start(np.eye(4))
+    for step in steps:
+        chain = extended(chain, step, kept)
+    return chain
+
+
+def random_steps(n: int, sigma: float = 0.01) -> list[GaussianPose]:
+    rng = np.random.default_rng(11)
+    roots = sigma * rng.normal(size=(n, 6, 6))
+    return [GaussianPose(se3.exp(rng.normal(scale=0.2, size=6)), R @ R.T) for R in roots]
+
+
+def test_steps_that_keep_no_bias_compound_as_independent_ones() -> None:
+    T, Y = np.eye(4), np.zeros((6, 6))
+    steps = random_steps(12)
+    for step in steps:
+        T, Y = g.compound_right(T, Y, *step)
+    np.testing.assert_array_equal(chained(steps, 0.0).T, T)
+    np.testing.assert_allclose(chained(steps, 0.0).Y, Y, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [2, 10])
+def test_a_bias_that_is_kept_grows_in_proportion_to_the_number_of_steps(monkeypatch, n) -> None:
+    """All of it shared: n times the standard deviation; a share s: n + s n (n - 1) times Y."""
+    Y = random_steps(1, 1e-4)[0].Y  # so small that the 4th order adds nothing
+    steps = [GaussianPose(np.eye(4), Y)] * n
+    expected = (n + g.BIAS_SHARE * n * (n - 1)) * Y
+    np.testing.assert_allclose(chained(steps, 1.0).Y, expected, rtol=0, atol=1e-4 * Y.max())
+    monkeypatch.setattr(g, "BIAS_SHARE", 1.0)
+    np.testing.assert_allclose(chained(steps, 1.0).Y, n**2 * Y, rtol=0, atol=1e-4 * Y.max())
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.9, 1.0])
+def test_a_chain_with_a_bias_covers_sampled_chains(monkeypatch, kept: float) -> None:
+    """Errors that are drawn as ``extended`` says, over steps that turn; the share is large."""
+    share, n = 0.6, 4000
+    monkeypatch.setattr(g, "BIAS_SHARE", share)
+    rng, steps = np.random.default_rng(1), random_steps(30, 0.002)
+    T_true, T, b = np.eye(4), np.tile(np.eye(4), (n, 1, 1)), rng.normal(size=(n, 6))
+    for step in steps:
+        z = np.sqrt(share) * b + np.sqrt(1 - share) * rng.normal(size=(n, 6))
+        T = T @ step.T @ se3.exp(z @ np.linalg.cholesky(step.Y).T)
+        T_true = T_true @ step.T
+        b = kept * b + np.sqrt(1 - kept**2) * rng.normal(size=(n, 6))
+    chain = chained(steps, kept)
+    d2 = mahalanobis(se3.log(se3.inverse(T_true) @ T), chain.Y) ** 2
+    assert np.mean(d2) / 6 == pytest.approx(1.0, abs=0.05)
+    if kept > 0.5:  # and independent steps would not
+        assert (
+            np.mean(mahalanobis(se3.log(se3.inverse(T_true) @ T), chained(steps, 0.0).Y) ** 2) > 9
+        )
+
+
+def test_a_chain_that_keeps_all_of_its_bias_stays_positive_definite(monkeypatch) -> None:
+    monkeypatch.setattr(g, "BIAS_SHARE", 1.0)
+    wide = GaussianPose(se3.exp([0.1, 0, 0, 0, 0, 0.5]), np.diag([1.0, 1, 1, 0.5, 0.5, 0.5]))
+    chain = Chained.start(np.eye(4))
+    for _ in range(100):
+        chain = extended(chain, wide, 1.0)
+        assert is_positive_definite(chain.Y)
+
+
+def test_the_sum_of_many_steps_varies_as_inflated_independent_ones() -> None:
+    Y, n, kept = random_steps(1, 1e-4)[0].Y, 3000, 0.8
+    total = chained([GaussianPose(np.eye(4), Y)] * n, kept).Y
+    np.testing.assert_allclose(total / n, g.inflation(kept) * Y, rtol=0.01, atol=1e-12)
+    assert g.inflation(0.0) == 1.0
+
+
+def test_bias_is_kept_at_rest_and_lost_over_a_long_way_or_a_turn() -> None:
+    assert g.bias_kept(np.eye(4)) == 1.0
+    assert g.bias_kept(se3.exp([5.0, 0, 0, 0, 0, 0])) < 1e-2
+    assert g.bias_kept(se3.exp([0, 0, 0, 0, 0, 3.0])) < 1e-2
+
+
+@pytest.mark.parametrize("common", [0.0, 0.4, 1.0])
+def test_a_pose_between_two_of_one_reference_loses_what_their_errors_share(common: float) -> None:
+    rng, n = np.random.default_rng(2), 20_000
+    first, second = random_steps(2, 0.002)
+    b = rng.normal(size=(n, 6))
+
+    def sampled(pose: GaussianPose) -> np.ndarray:
+        z = np.sqrt(common) * b + np.sqrt(1 - common) * rng.normal(size=(n, 6))
+        return pose.T @ se3.exp(z @ np.linalg.cholesky(pose.Y).T)
+
+    T, Y = g.between(first, second, common)
+    np.testing.assert_allclose(T, se3.inverse(first.T) @ second.T, atol=1e-15)
+    xi = se3.log(se3.inverse(T) @ se3.inverse(sampled(first)) @ sampled(second))
+    assert np.mean(mahalanobis(xi, Y) ** 2) / 6 == pytest.approx(1.0, abs=0.03)
+    same = g.between(first, GaussianPose(first.T, first.Y), 1.0)
+    np.testing.assert_allclose(same.Y, np.zeros((6, 6)), atol=1e-15)

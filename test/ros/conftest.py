@@ -61,7 +61,11 @@ def node(
 ) -> Iterator[NodeProcess]:
     """A node that serves a whole module; it must live to the end and leave with status 0."""
     log = tmp_path_factory.mktemp("node") / "log.txt"
-    parameters = {"node.model": model_path, "node.odometry_timeout_s": 0.3}
+    parameters = {
+        "node.model": model_path,
+        "node.odometry_timeout_s": 0.3,
+        "node.pairing": "consecutive",
+    }
     with NodeProcess(log, domain_id, parameters) as process:
         yield process
         process.check()

@@ -62,6 +62,7 @@ def start(tmp_path, domain_id, model_path) -> Iterator[Start]:
 
         def call(*ros_arguments: str, **settings: Any) -> replay.Player:
             parameters = {"node.model": model_path, "node.odometry_timeout_s": 0.3}
+            parameters["node.pairing"] = "consecutive"
             parameters |= {f"node.{name}": value for name, value in settings.items()}
             log = tmp_path / "log.txt"
             node = NodeProcess(log, domain_id, parameters, ros_arguments)
@@ -176,8 +177,8 @@ def test_an_external_pose_belongs_to_the_cloud_of_its_stamp(start) -> None:
 
 
 def test_a_keyframe_stays_until_the_sensor_has_left_it(start) -> None:
-    player = start(pairing="keyframe", keyframe_distance_m=0.4, keyframe_min_overlap=0.0)
-    scans = walk(8)
+    player = start(pairing="keyframe", keyframe_distance_ratio=0.145, keyframe_min_overlap=0.0)
+    scans = walk(8)  # half of the points are within 2.76 m: 0.4 m make a keyframe
     played = replay.play(player, scans)
     references = [
         (int(played.status[scan.stamp_ns]["reference_stamp_ns"]) - T0) // STEP_NS

@@ -36,10 +36,15 @@ def of_points(T: np.ndarray, seed: int) -> np.ndarray:
 
 
 def answers(
-    model: Model, see: Callable[[np.ndarray, int], np.ndarray], v_m_s: float, n: int, seed: int
+    model: Model,
+    see: Callable[[np.ndarray, int], np.ndarray],
+    v_m_s: float,
+    n: int,
+    seed: int,
+    pairing: str = "keyframe",
 ) -> list[Answer]:
     """Track n scans along x by odometry that says that the robot stands still."""
-    tracker = Tracker(model, model.pipeline, NodeConfig())
+    tracker = Tracker(model, model.pipeline, NodeConfig(pairing=pairing))
     found = []
     for i in range(n):
         T = se3.exp([1e-9 * DT_NS * v_m_s * i, 0, 0, 0, 0, 0])
@@ -56,10 +61,13 @@ def mean_twist(found: list[Answer]) -> tuple[np.ndarray, np.ndarray]:
     return np.mean(twists, axis=0), np.sum(C, axis=0) / len(C) ** 2
 
 
+@pytest.mark.parametrize("pairing", ["keyframe", "consecutive"])
 @pytest.mark.parametrize("see", [of_rings, of_points])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_parked_robot_has_no_velocity_and_stays_within_its_covariance(model, see, seed) -> None:
-    found = answers(model, see, 0.0, 80, seed)
+def test_a_parked_robot_has_no_velocity_and_stays_within_its_covariance(
+    model, see, seed, pairing
+) -> None:
+    found = answers(model, see, 0.0, 80, seed, pairing)
     mean, C = mean_twist(found)
     assert (np.abs(mean) < 2.5 * np.sqrt(np.diag(C))).all()
     assert np.abs(mean[:3]).max() < 2e-3  # m/s
@@ -68,9 +76,10 @@ def test_a_parked_robot_has_no_velocity_and_stays_within_its_covariance(model, s
     assert {a.reference_ns for a in found} == {0}
 
 
+@pytest.mark.parametrize("pairing", ["keyframe", "consecutive"])
 @pytest.mark.parametrize("see", [of_rings, of_points])
-def test_a_robot_that_creeps_at_1_cm_s_is_followed(model, see) -> None:
-    found = answers(model, see, 0.01, 80, 7)
+def test_a_robot_that_creeps_at_1_cm_s_is_followed(model, see, pairing) -> None:
+    found = answers(model, see, 0.01, 80, 7, pairing)
     assert abs(found[-1].pose.T[0, 3] - 0.079) < 0.015
     truth = se3.exp([0.079, 0, 0, 0, 0, 0])
     D = mahalanobis(se3.log(se3.inverse(truth) @ found[-1].pose.T), found[-1].pose.Y)
@@ -82,5 +91,5 @@ def test_a_robot_that_creeps_at_1_cm_s_is_followed(model, see) -> None:
 
 
 def test_a_robot_that_moves_has_the_scan_before_as_its_reference(model) -> None:
-    found = answers(model, of_points, 2.0, 6, 0)
+    found = answers(model, of_points, 2.0, 6, 0, "consecutive")
     assert [a.stamp_ns - a.reference_ns for a in found] == 5 * [DT_NS]

@@ -5,7 +5,7 @@ import numpy as np
 from cello3d_ros.clouds.shape import filtered
 from cello3d_ros.config import CloudConfig
 from cello3d_ros.geometry import se3
-from cello3d_ros.geometry.gaussian import GaussianPose
+from cello3d_ros.geometry.gaussian import Chained
 from cello3d_ros.tracking.chain import Chain, Frame, Link
 from cello3d_ros.tracking.guess import Place
 
@@ -18,7 +18,7 @@ def link(stamp_ns: int, T: np.ndarray) -> Link:
     rng = np.random.default_rng(0)
     cloud = filtered(rng.normal(size=(200, 3), scale=5.0), CloudConfig(), rng)
     frame = Frame(stamp_ns, cloud, Place(T), T)
-    return Link(frame, GaussianPose(T, np.zeros((6, 6))))
+    return Link(frame, Chained.start(T))
 
 
 def test_motion_is_carried_on_at_constant_velocity() -> None:

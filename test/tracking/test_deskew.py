@@ -26,7 +26,7 @@ N = 6
 
 
 def tracker_of(**settings) -> Tracker:
-    config = Config(node=NodeConfig(**settings))
+    config = Config(node=NodeConfig(**{"pairing": "consecutive", **settings}))
     return Tracker(MODEL, config, config.node)
 
 
@@ -73,7 +73,7 @@ def test_without_odometry_the_last_registration_undoes_a_steady_motion(kind: str
 
 @pytest.mark.parametrize("pairing", ["consecutive", "keyframe"])
 def test_the_first_scan_of_a_chain_is_undone_once_its_motion_is_known(pairing: str) -> None:
-    tracker = tracker_of(pairing=pairing, keyframe_distance_m=0.5)
+    tracker = tracker_of(pairing=pairing, keyframe_distance_ratio=0.2)
     for k in range(2):
         scan = swept(k)
         tracker.step(scan.stamp_ns, scan.points, Place(scan.T_odom_sensor), scan.time_s)

@@ -18,7 +18,16 @@ from cello3d_ros.errors import (
     RegistrationError,
 )
 from cello3d_ros.geometry import se3
-from cello3d_ros.geometry.gaussian import compound_right, is_positive_definite
+from cello3d_ros.geometry.gaussian import (
+    REFERENCE_SHARE,
+    Chained,
+    GaussianPose,
+    between,
+    bias_kept,
+    extended,
+    inflation,
+    is_positive_definite,
+)
 from cello3d_ros.registration.icp import Registration
 from cello3d_ros.tracking import external as external_module
 from cello3d_ros.tracking import map as map_module
@@ -64,11 +73,13 @@ def asked(monkeypatch):
 @pytest.fixture
 def tracker() -> Tracker:
     """A tracker that gives a reference up after two failures."""
-    config = Config(node=NodeConfig(max_failures=2, max_pair_gap_s=5.0))
+    node = NodeConfig(pairing="consecutive", max_failures=2, max_pair_gap_s=5.0)
+    config = Config(node=node)
     return Tracker(constant_model(WIDE, 704), config, config.node)
 
 
 POINTS = room(np.random.default_rng(0), 500)
+RANGE_M = float(np.median(np.linalg.norm(POINTS, axis=1)))  # the filters keep all
 SMALL_STEPS = [se3.exp(np.array([0.3, 0.1, 0.0, 0.0, 0.01, 0.05]) * i) for i in range(5)]
 POSES = [se3.exp(np.array([0.5, 0.1, 0.0, 0.1, 0.2, 0.6]) * i) for i in range(8)]
 
@@ -82,16 +93,15 @@ def test_first_guess_is_the_motion_of_the_odometry_in_the_frame_of_the_reference
     assert (answer.reference_ns, answer.stamp_ns) == (0, S)
 
 
-def test_chain_starts_at_the_odometry_and_is_compounded_to_4th_order(tracker, asked) -> None:
-    T, Y = POSES[2], np.zeros((6, 6))
+def test_chain_starts_at_the_odometry_and_compounds_what_neighbors_share(tracker, asked) -> None:
+    chain = Chained.start(POSES[2])
     tracker.step(0, POINTS, Place(POSES[2]))
     for i in range(3, 7):
         answer = tracker.step(i * S, POINTS, Place(POSES[i]))
-        T, Y = compound_right(T, Y, se3.inverse(POSES[i - 1]) @ POSES[i], WIDE, order=4)
-        np.testing.assert_allclose(answer.pose.T, T, atol=1e-12)
-        np.testing.assert_allclose(answer.pose.Y, Y, atol=1e-12)
-    second = compound_right(T, Y, np.eye(4), WIDE, order=2).Y
-    assert np.abs(second - compound_right(T, Y, np.eye(4), WIDE, order=4).Y).max() > 1e-3
+        T_step = se3.inverse(POSES[i - 1]) @ POSES[i]
+        chain = extended(chain, GaussianPose(T_step, WIDE), bias_kept(T_step))
+        np.testing.assert_allclose(answer.pose.T, chain.T, atol=1e-12)
+        np.testing.assert_allclose(answer.pose.Y, chain.Y, atol=1e-12)
 
 
 def test_a_long_chain_stays_positive_definite(tracker, asked) -> None:
@@ -104,7 +114,7 @@ def test_a_long_chain_stays_positive_definite(tracker, asked) -> None:
 @pytest.mark.parametrize("model", [load_model(shipped_model_path()), constant_model(WIDE, 704)])
 def test_answers_are_the_same_whether_it_is_worked_ahead_or_not(pairing_name, model) -> None:
     """And the same as those of clouds that were prepared at once."""
-    node = NodeConfig(pairing=pairing_name, keyframe_distance_m=1.0)
+    node = NodeConfig(pairing=pairing_name, keyframe_distance_ratio=1.0 / RANGE_M)
     config = Config(node=node)
     ahead, late = (Tracker(model, config, node) for _ in range(2))
     scans = [se3.transform(se3.inverse(T), 2.0 * POINTS) for T in SMALL_STEPS]
@@ -269,7 +279,7 @@ def test_reasons_are_the_narrowest_name() -> None:
 
 def tracker_with(**settings) -> Tracker:
     """A tracker that gives a reference up after three failures."""
-    config = Config(node=NodeConfig(**settings))
+    config = Config(node=NodeConfig(**{"pairing": "consecutive", **settings}))
     return Tracker(constant_model(WIDE, 704), config, config.node)
 
 
@@ -278,7 +288,7 @@ def shift(x: float) -> np.ndarray:
 
 
 def test_a_keyframe_stays_until_the_scan_is_far_enough(asked) -> None:
-    tracker = tracker_with(pairing="keyframe", keyframe_distance_m=1.0)
+    tracker = tracker_with(pairing="keyframe", keyframe_distance_ratio=1.0 / RANGE_M)
     references = []
     for i in range(9):
         answer = tracker.step(i * S, POINTS, Place(shift(0.4 * i)))
@@ -294,24 +304,26 @@ def test_a_keyframe_stays_until_the_scan_is_far_enough(asked) -> None:
     ],
 )
 def test_a_turn_and_a_small_overlap_make_a_keyframe(asked, settings, step) -> None:
-    tracker = tracker_with(pairing="keyframe", keyframe_distance_m=10.0, **settings)
+    tracker = tracker_with(pairing="keyframe", keyframe_distance_ratio=10.0 / RANGE_M, **settings)
     tracker.step(0, POINTS, Place(np.eye(4)))
     tracker.step(S, POINTS, Place(step))
     assert tracker.step(2 * S, POINTS, Place(step)).reference_ns == S
 
 
 def test_covariance_accumulates_only_from_keyframe_to_keyframe(asked) -> None:
-    tracker = tracker_with(pairing="keyframe", keyframe_distance_m=1.0)
+    tracker = tracker_with(pairing="keyframe", keyframe_distance_ratio=1.0 / RANGE_M)
     answers = [tracker.step(i * S, POINTS, Place(shift(0.4 * i))) for i in range(6)]
     for answer in answers[1:4]:
         np.testing.assert_allclose(answer.pose.Y, WIDE, atol=1e-12)
-    expected = compound_right(shift(1.2), WIDE, shift(0.8), WIDE, order=4)
+    expected = Chained.start(np.eye(4))
+    for way_m in (1.2, 0.8):
+        expected = extended(expected, GaussianPose(shift(way_m), WIDE), bias_kept(shift(way_m)))
     np.testing.assert_allclose(answers[5].pose.Y, expected.Y, atol=1e-12)
     np.testing.assert_allclose(answers[5].pose.T, expected.T, atol=1e-12)
 
 
 def test_a_scan_that_fails_against_the_keyframe_leaves_the_chain_to_the_latest_scan(asked) -> None:
-    tracker = tracker_with(pairing="keyframe", keyframe_distance_m=10.0)
+    tracker = tracker_with(pairing="keyframe", keyframe_distance_ratio=10.0 / RANGE_M)
     for i in range(3):
         tracker.step(i * S, POINTS, Place(shift(0.1 * i)))
     asked[1].append(NoOverlapError("nothing in common"))
@@ -522,16 +534,18 @@ def test_the_motion_since_the_scan_before_is_known_except_after_a_break_or_on_a_
 ) -> None:
     monkeypatch.setitem(globals(), "WIDE", 1e-4 * np.eye(6))
     for pairing, distance_m in (("consecutive", 1.0), ("keyframe", 1e9)):
-        tracker = tracker_with(pairing=pairing, keyframe_distance_m=distance_m)
+        tracker = tracker_with(pairing=pairing, keyframe_distance_ratio=distance_m)
         for i, T in enumerate(SMALL_STEPS):
             answer = tracker.step(i * S, POINTS, Place(T))
         moved = se3.inverse(SMALL_STEPS[-2]) @ SMALL_STEPS[-1]
         assert answer.span_s == 1.0
         assert answer.reference_ns == (3 * S if pairing == "consecutive" else 0)
         np.testing.assert_allclose(answer.motion.T, moved, atol=1e-12)
-        Ad = se3.adjoint(se3.inverse(moved))
-        shared = 0.0 if pairing == "consecutive" else Ad @ WIDE @ Ad.T
-        np.testing.assert_allclose(answer.motion.Y, WIDE + shared, atol=1e-12)
+        steps = [GaussianPose(se3.inverse(SMALL_STEPS[0]) @ T, WIDE) for T in SMALL_STEPS[-2:]]
+        expected = inflation(bias_kept(moved)) * WIDE
+        if pairing == "keyframe":
+            expected = between(*steps, REFERENCE_SHARE).Y
+        np.testing.assert_allclose(answer.motion.Y, expected, atol=1e-12)
     on_map = tracker_with(pairing="topics")
     on_map.take_map(7, MAP, "map")
     for i in range(3):
