@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -48,9 +48,9 @@ class Runs(NamedTuple):
 
 
 class _Run(NamedTuple):
-    """The poses of one odometry, whether it got lost and whether the model said so."""
+    """The steps of one odometry, whether it got lost and whether the model said so."""
 
-    path: list[GaussianPose]
+    steps: list[GaussianPose]
     is_lost: bool
     is_told: bool
 
@@ -67,9 +67,11 @@ def odometry_runs(
 
     T_world_sensor: (L, 4, 4) ground truth.  Each registration of each run starts from
     ``T_mean exp(xi)``, xi ~ N(0, model.sampling.variance I), draws its own subsamples and has its
-    own covariance predicted.  A run does not depend on the others or on the threads.
+    own covariance predicted.  A run does not depend on the others or on the threads.  Covariances
+    are compounded with the bias that neighbouring steps share.
     """
-    return runs_of_models(clouds, T_world_sensor, [model], n_runs, seed, n_threads)[0]
+    runs = _runs(clouds, T_world_sensor, [model], n_runs, seed, n_threads)
+    return _stacked(runs, 0, T_world_sensor, compound_path)
 
 
 def runs_of_models(
@@ -82,43 +84,63 @@ def runs_of_models(
 ) -> list[Runs]:
     """Return the same runs judged by each of some models that have one pipeline.
 
-    Starts scatter as in the sampling of the first.
+    Starts scatter as in the sampling of the first.  Steps are compounded as independent ones, as
+    in the paper.
     """
+    runs = _runs(clouds, T_world_sensor, models, n_runs, seed, n_threads)
+    return [_stacked(runs, k, T_world_sensor, independent_path) for k in range(len(models))]
+
+
+def _runs(
+    clouds: Sequence[Cloud],
+    T_world_sensor: Array,
+    models: Sequence[Model],
+    n_runs: int,
+    seed: int,
+    n_threads: int,
+) -> list[list[_Run] | None]:
+    """Return for each run what each model makes of it, None without an answer."""
 
     def one(run: int) -> list[_Run] | None:
         return _run(clouds, T_world_sensor, models, np.random.default_rng([seed, run]))
 
     if n_threads <= 1:
-        runs = [one(run) for run in range(n_runs)]
-    else:
-        with ThreadPoolExecutor(n_threads) as pool:
-            runs = list(pool.map(one, range(n_runs)))
-    reached = [run for run in runs if run is not None]
+        return [one(run) for run in range(n_runs)]
+    with ThreadPoolExecutor(n_threads) as pool:
+        return list(pool.map(one, range(n_runs)))
+
+
+def _stacked(
+    runs: Sequence[list[_Run] | None],
+    k: int,
+    T_world_sensor: Array,
+    compound: Callable[[Sequence[GaussianPose]], list[GaussianPose]],
+) -> Runs:
+    """Return what the k-th model makes of the runs."""
+    reached = [run[k] for run in runs if run is not None]
+    paths = tuple(compound(run.steps) for run in reached)
     T_true = inverse(T_world_sensor[0]) @ T_world_sensor[-1]
-    return [
-        _stacked([run[k] for run in reached], T_true, n_runs - len(reached))
-        for k in range(len(models))
-    ]
-
-
-def _stacked(runs: Sequence[_Run], T_true: Array, n_failed: int) -> Runs:
-    xi = log(inverse(T_true) @ np.array([run.path[-1].T for run in runs]).reshape(-1, 4, 4))
-    Y = np.array([run.path[-1].Y for run in runs]).reshape(-1, 6, 6)
-    lost = np.array([run.is_lost for run in runs], np.bool_)
-    told = np.array([run.is_told for run in runs], np.bool_)
-    return Runs(xi, Y, lost, told, n_failed, tuple(run.path for run in runs))
-
-
-def compound_chain(steps: Sequence[GaussianPose]) -> GaussianPose:
-    """Return the pose of all steps after each other, right covariance, to 4th order."""
-    return compound_path(steps)[-1]
+    xi = log(inverse(T_true) @ np.array([path[-1].T for path in paths]).reshape(-1, 4, 4))
+    Y = np.array([path[-1].Y for path in paths]).reshape(-1, 6, 6)
+    lost = np.array([run.is_lost for run in reached], np.bool_)
+    told = np.array([run.is_told for run in reached], np.bool_)
+    return Runs(xi, Y, lost, told, len(runs) - len(reached), paths)
 
 
 def compound_path(steps: Sequence[GaussianPose]) -> list[GaussianPose]:
-    """Return the pose after each step, right covariance (``extended``)."""
+    """Return the pose after each step, right covariance, with the bias that neighbours share."""
+    return _path(steps, [bias_kept(step.T) for step in steps])
+
+
+def independent_path(steps: Sequence[GaussianPose]) -> list[GaussianPose]:
+    """Return the pose after each step, right covariance, of steps that share nothing."""
+    return _path(steps, [0.0] * len(steps))
+
+
+def _path(steps: Sequence[GaussianPose], kept: Sequence[float]) -> list[GaussianPose]:
     chain, path = Chained.start(np.eye(4)), []
-    for step in steps:
-        chain = extended(chain, step, bias_kept(step.T))
+    for step, phi in zip(steps, kept, strict=True):
+        chain = extended(chain, step, phi)
         path.append(chain.pose)
     return path
 
@@ -208,6 +230,4 @@ def _run(
             is_told[m] |= answer.is_lost
         xi = log(inverse(T_mean) @ found.T_ref_read)
         is_lost |= bool(far_from_truth(xi, sampling.cluster_scale_m, sampling.cluster_scale_rad))
-    return [
-        _Run(compound_path(path), is_lost, told) for path, told in zip(steps, is_told, strict=True)
-    ]
+    return [_Run(steps_of, is_lost, told) for steps_of, told in zip(steps, is_told, strict=True)]

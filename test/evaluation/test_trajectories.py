@@ -14,8 +14,9 @@ from cello3d_ros.evaluation import trajectories as module
 from cello3d_ros.evaluation.result import Consistency, Distances
 from cello3d_ros.evaluation.trajectories import (
     Runs,
-    compound_chain,
+    compound_path,
     consistency,
+    independent_path,
     length_m,
     odometry_runs,
 )
@@ -34,7 +35,7 @@ def test_a_chain_of_true_covariances_is_consistent():
     for T, root in zip(motions, roots, strict=True):
         finals = finals @ T @ exp(rng.normal(size=(n, 6)) @ root.T)
         truth = truth @ T
-    chain = compound_chain([GaussianPose(*step) for step in zip(motions, Y, strict=True)])
+    chain = independent_path([GaussianPose(*step) for step in zip(motions, Y, strict=True)])[-1]
     np.testing.assert_allclose(chain.T, truth, atol=1e-12)
     runs = Runs(
         log(inverse(truth) @ finals),
@@ -70,7 +71,7 @@ def test_distances_are_those_of_the_blocks():
 
 def test_a_chain_too_wide_for_the_fourth_order_stays_positive_definite():
     wide = GaussianPose(exp([1.0, 0, 0, 0, 0, 0.5]), np.diag([1.0, 1, 1, 2, 2, 2]))
-    chain = compound_chain([wide] * 6)
+    chain = compound_path([wide] * 6)[-1]
     assert is_positive_definite(chain.Y)
 
 
