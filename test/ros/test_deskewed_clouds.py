@@ -28,6 +28,7 @@ def test_the_node_undoes_the_motion_and_says_by_what(
     tmp_path, domain_id, model_path, stamped
 ) -> None:
     parameters = {"node.model": model_path, "node.odometry_timeout_s": 5.0}
+    parameters["node.pairing"] = "consecutive"
     node = NodeProcess(tmp_path / "log.txt", domain_id, parameters)
     player = replay.Player(domain_id, check=node.check)
     told, errors = [], []
