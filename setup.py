@@ -22,6 +22,7 @@ REPORT = ["plotly>=6"]  # maintained; its 3-D views work in one file without a n
 TOOLS = ["ruff", "mypy", "import-linter", "types-PyYAML", "playwright"]
 FUSION = ["gtsam>=4.3"]  # pose graphs; its wheels take the numpy of today
 INTEGRATION = ["g2opy>=2.3", "evo>=1.31", "pandas>=2.2"]  # what docs/integration.md shows
+NOTEBOOK = ["nbclient>=0.10", "ipykernel>=6.29"]  # run docs/tutorial.ipynb; no Jupyter around it
 DOCS = ["pdoc>=15"]  # reads docstrings as they are, needs no configuration and no theme
 BENCH = ["kiss-icp>=1.2"]  # what benchmarks/online.py compares with
 TEST = [
@@ -78,6 +79,7 @@ setup(
             *TEST,
             *FUSION,
             *INTEGRATION,
+            *NOTEBOOK,
             *DOCS,
             "ruff",
             "mypy",

@@ -1,47 +1,16 @@
-"""config/examples/robot_localization.yaml in a small copy of the filter that reads it.
-
-The filter's rules (robot_localization: src/ekf.cpp and src/filter_base.cpp): 15 states x y z, roll
-pitch yaw, their velocities in the body, accelerations; constant acceleration; the covariance grows
-by ``dt Q``; variances of measurements are at least 1e-9.
-"""
+"""config/examples/robot_localization.yaml in a small copy of the filter that reads it."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from scipy.spatial.transform import Rotation
+from filters import VELOCITIES, corrected, grown, predicted
 from scipy.special import chdtri
 
 FILE = Path(__file__).parents[1] / "config" / "examples" / "robot_localization.yaml"
 N_RUNS, SECONDS, LIDAR_HZ = 60, 20, 10
 OLD = [0.05, 0.05, 0.06, 0.03, 0.03, 0.06, 0.025, 0.025, 0.04, 0.01, 0.01, 0.02, 0.01, 0.01, 0.015]
-
-
-def predicted(x: np.ndarray, dt: float) -> np.ndarray:
-    """The state after dt.  (..., 15)."""
-    shape = x.shape
-    x = x.reshape(-1, 15)
-    R = Rotation.from_euler("ZYX", x[:, [5, 4, 3]])
-    roll, pitch = x[:, 3], x[:, 4]
-    p, q, r = x[:, 9:12].T
-    rates = [
-        p + (q * np.sin(roll) + r * np.cos(roll)) * np.tan(pitch),
-        q * np.cos(roll) - r * np.sin(roll),
-        (q * np.sin(roll) + r * np.cos(roll)) / np.cos(pitch),
-    ]
-    out = x.copy()
-    out[:, :3] += R.apply(x[:, 6:9] * dt + 0.5 * x[:, 12:] * dt**2)
-    out[:, 3:6] += np.stack(rates, axis=1) * dt
-    out[:, 6:9] += x[:, 12:] * dt
-    return out.reshape(shape)
-
-
-def jacobian(x: np.ndarray, dt: float, step: float = 1e-6) -> np.ndarray:
-    """d predicted / d x of each run.  (n, 15, 15)."""
-    moved = x[:, None, :] + step * np.eye(15)
-    back = x[:, None, :] - step * np.eye(15)
-    return np.swapaxes((predicted(moved, dt) - predicted(back, dt)) / (2 * step), 1, 2)
 
 
 def filtered(Q: np.ndarray, hz: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -56,7 +25,6 @@ def filtered(Q: np.ndarray, hz: float, seed: int = 0) -> tuple[np.ndarray, np.nd
     true, x = np.zeros((n, 15)), np.zeros((n, 15))
     true[:, 6] = x[:, 6] = 1.0
     P = np.tile(1e-9 * np.eye(15), (n, 1, 1))
-    H = np.eye(15)[6:12]
     for _ in range(SECONDS * LIDAR_HZ):
         turn = np.zeros((n, 3))
         turn[:, 2] = rng.normal(scale=0.5, size=n)
@@ -66,13 +34,9 @@ def filtered(Q: np.ndarray, hz: float, seed: int = 0) -> tuple[np.ndarray, np.nd
             true[:, 9:12] += (turn - true[:, 9:12]) * dt
             twist += np.hstack([true[:, 6:9] + 0.5 * dt * true[:, 12:], true[:, 9:12]])
             true = predicted(true, dt)
-            F = jacobian(x, dt)
-            x, P = predicted(x, dt), F @ P @ np.swapaxes(F, 1, 2) + dt * Q
+            x, P = grown(x, P, Q, dt)
         z = twist * dt * LIDAR_HZ + sigma * rng.normal(size=(n, 6))
-        S = P[:, 6:12, 6:12] + np.diag(np.maximum(sigma**2, 1e-9))
-        K = P @ H.T @ np.linalg.inv(S)
-        x = x + np.einsum("nij,nj->ni", K, z - x[:, 6:12])
-        P = P - K @ H @ P
+        x, P = corrected(x, P, VELOCITIES, z, np.diag(sigma**2))
     return (x - true)[:, :6], P[:, :6, :6]
 
 

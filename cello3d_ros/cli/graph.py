@@ -54,6 +54,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "a metre and by a share of each turn (1 sigma)",
     )
     parser.add_argument(
+        "--scale",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="factor on the covariances of registrations, which are not independent where they "
+        "share a scan (docs/fusion.md)",
+    )
+    parser.add_argument(
         "--registration",
         choices=("icp", "external"),
         default="icp",
@@ -82,7 +90,7 @@ def run(arguments: argparse.Namespace) -> None:
     recording = posed(source, poses, arguments.jobs, keeps_odometry=settings.drift is not None)
     estimator = Estimator(
         arguments.model or "general",
-        settings=DEFAULTS._replace(n_threads=arguments.jobs),
+        settings=DEFAULTS._replace(n_threads=arguments.jobs, scale=arguments.scale),
         pipeline=PIPELINES.get(arguments.pipeline),
     )
     scans = with_progress(recording, len(recording), recording.name)
@@ -102,6 +110,8 @@ def _settings(arguments: argparse.Namespace) -> GraphSettings:
 
     if arguments.max_gap < 1:
         raise RecordingError(f"--max-gap must be at least 1: {arguments.max_gap}")
+    if not 0.0 < arguments.scale < np.inf:
+        raise RecordingError(f"--scale must be above 0: {arguments.scale}")
     drift = None
     if arguments.odometry_drift is not None:
         share, deg_per_m, turn_share = arguments.odometry_drift

@@ -244,6 +244,17 @@ def test_steps_of_odometry_err_as_the_user_says(
     assert {row["novelty"] == "" for row in rows if row["kind"] == "odometry"} == {True}
 
 
+def test_a_scale_widens_registrations_and_nothing_else(
+    recording: Path, poses: Path, tmp_path: Path
+) -> None:
+    flags = ("--poses", str(poses))
+    plain = graph(recording, tmp_path / "one.json", *flags)
+    wide = graph(recording, tmp_path / "two.json", *flags, "--scale", "1.5")
+    for one, two in zip(plain, wide, strict=True):
+        assert one["T"] == two["T"]
+        np.testing.assert_allclose(matrices(two)[1], 1.5 * matrices(one)[1], rtol=1e-6)
+
+
 def test_external_poses_keep_their_values_and_get_covariances(
     recording: Path, poses: Path, tmp_path: Path
 ) -> None:
@@ -303,6 +314,7 @@ def test_what_cannot_be_is_one_sentence(
     assert "a graph is written as .g2o, .json, .csv, .tum, .txt" in wrong
     assert "existing folder" in refused(capsys, *posed, "--out", tmp_path / "no" / "g.g2o")
     assert "at least 1: 0" in refused(capsys, *posed, *out, "--max-gap", 0)
+    assert "--scale must be above 0" in refused(capsys, *posed, *out, "--scale", 0)
     assert "has no odometry" in refused(capsys, *posed, *out, "--odometry-drift", 1, 1, 1)
     assert "not negative" in refused(capsys, *posed, *out, "--odometry-drift", -1, 1, 1)
     for text, sentence in {
