@@ -21,7 +21,7 @@ from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.threads import in_threads
 
 _CHUNK = 256  # leaves of one task
-_WIDENINGS = (1, 2, 3)  # times the neighbours that are tried until they are not on a line
+WIDENINGS = (1, 2, 3)  # times the neighbours that are tried until they are not on a line
 
 
 class Cloud(NamedTuple):
@@ -113,7 +113,7 @@ def local_shape(
         covariances(tree.leaves, n, k, first, stop, wanted, near)
         _shape(near, wanted[part], normals[part], planarity[part], cylindricality[part])
 
-    for factor in _WIDENINGS if min_spread > 0.0 else _WIDENINGS[:1]:
+    for factor in WIDENINGS if min_spread > 0.0 else WIDENINGS[:1]:
         starts = range(0, len(tree.lanes), _CHUNK)
         in_threads(partial(task, k=factor * k), starts, n_threads)
         wanted &= cylindricality > 1.0 - min_spread

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.atomic import new_file
-from cello3d_ros.clouds.shape import Cloud, local_shape
+from cello3d_ros.clouds.shape import Cloud, with_shape
 from cello3d_ros.config import Pipeline
 from cello3d_ros.errors import CloudError, RecordingError
 from cello3d_ros.geometry.pose_track import PoseTrack
@@ -53,7 +53,7 @@ _FLOOR_M, _FLOOR_RAD = 1e-4, 1e-5
 _OUTLIER = 8.0  # times the usual difference of half-sets: a scan that does not hold,
 _OUTLIER_M, _OUTLIER_RAD = 0.03, 0.015  # from these on
 _STATE = "state.npz"
-_VERSION = 2  # of the state
+_VERSION = 3  # of the state
 _FACTS = ("sweep", "position", "is_last", "is_done", "moves_m", "compensated")
 _ARRAYS = ("stamps_ns", "keyframes", "held", "moved", "halves", "first_poses", "pairs")
 
@@ -201,8 +201,7 @@ def _begin(
             last = digest
             compensated |= raw.time_s is not None
             store.add_raw(k, raw)
-            cloud = cloud_of(raw.points)
-            cloud = cloud._replace(normals=local_shape(cloud.tree, pipeline.cloud.n_neighbors)[0])
+            cloud = with_shape(cloud_of(raw.points), pipeline.cloud)
             store.add_shaped(k, 0, ShapedScan(cloud.points, cloud.normals))
             yield Placed(k, scan.stamp_ns, cloud, _start_pose(scan, start))
 

@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cello3d_ros.clouds.filters import limit_density
 from cello3d_ros.clouds.neighbors import KdTree, build_tree, nearest
-from cello3d_ros.clouds.shape import Cloud
-from cello3d_ros.config import IcpConfig, Pipeline
+from cello3d_ros.clouds.shape import WIDENINGS, Cloud
+from cello3d_ros.config import CloudConfig, IcpConfig, Pipeline
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log, transform
 from cello3d_ros.learning.align_chain import MIN_SHARE, share_on_surfaces
 from cello3d_ros.learning.align_scans import ScanStore, ShapedScan, without_motion
@@ -74,8 +75,9 @@ def visit(
     """Register scan k to the union of its neighbours, and find the normals of its points.
 
     poses: (n, 4, 4).  neighbors: scan -> its points.  own: (N, 3), points of scan k.
-    The normals are those of all scans together: denser than one scan, and without the rings of
-    its pattern.
+    The normals are those of all scans together, at the density of one: without the rings of its
+    pattern, and wide enough for noise.  All points of scans a few cm apart would do worse: the
+    nearest are on one band of rings, as thick as it is wide.
     """
     if not neighbors:
         alone = ShapedScan(own, np.zeros_like(own))
@@ -97,8 +99,16 @@ def visit(
     halves = np.zeros(6)
     if wants_halves and holds and len(neighbors) >= 2:
         halves = _halves(k, poses, neighbors, reading, step, icp, seed)
-    normals = common_normals(reading.tree, union.tree, step, pipeline.cloud.n_neighbors, n_threads)
-    return Visit(poses[k] @ step, moved, share, holds, halves, ShapedScan(reading.points, normals))
+    points = transform(step, reading.points)
+    surface = limit_density(
+        np.concatenate([points, union.points]),
+        pipeline.cloud.voxel_m,
+        pipeline.cloud.max_points_per_voxel,
+        rng,
+    )
+    normals = common_normals(build_tree(surface), points, pipeline.cloud, n_threads)
+    shaped = ShapedScan(reading.points, normals @ step[:3, :3])
+    return Visit(poses[k] @ step, moved, share, holds, halves, shaped)
 
 
 def gathered(T_world: Array, poses: Array, scans: dict[int, ShapedScan]) -> Cloud:
@@ -109,21 +119,22 @@ def gathered(T_world: Array, poses: Array, scans: dict[int, ShapedScan]) -> Clou
     return cloud_of(points, normals)
 
 
-def common_normals(own: KdTree, others: KdTree, T: Array, k: int, n_threads: int = 1) -> Array:
-    """Return the normals (N, 3) of the points of ``own`` from the k nearest of both trees.
+def common_normals(tree: KdTree, points: Array, config: CloudConfig, n_threads: int = 1) -> Array:
+    """Return the normals (N, 3) of points from their nearest neighbours in a tree.
 
-    T: (4, 4), from the frame of ``own`` to that of ``others``.  They are in the frame of ``own``.
+    As in ``local_shape``: where the neighbours are on a line, two and three times as many are
+    tried, and the normal is 0 if they are on a line as well.
     """
-    points = transform(T, own.points)
-    d2_own, i_own = nearest(own, own.points, k, n_threads)
-    d2_others, i_others = nearest(others, points, k, n_threads)
-    d2 = np.concatenate([d2_own, d2_others], axis=1)
-    first = np.argpartition(d2, k - 1, axis=1)[:, :k]
-    indices = np.take_along_axis(np.concatenate([i_own, i_others + len(points)], axis=1), first, 1)
-    near = np.concatenate([points, others.points])[indices]
-    near -= near.mean(axis=1, keepdims=True)
-    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
-    return np.asarray(normals @ T[:3, :3])
+    normals, left = np.zeros(points.shape), np.arange(len(points))
+    for factor in WIDENINGS:
+        k = min(factor * config.n_neighbors, len(tree.points))
+        near = tree.points[nearest(tree, points[left], k, n_threads)[1]]
+        near -= near.mean(axis=1, keepdims=True)
+        squares, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
+        is_plane = squares[:, 1] >= config.min_spread**2 * squares[:, 2]
+        normals[left[is_plane]] = axes[is_plane, :, 0]
+        left = left[~is_plane]
+    return normals
 
 
 def _halves(
