@@ -39,6 +39,16 @@ def limit_density(
     return _kept(points, _first_of_cells(points, voxel_m, max_points, turns))
 
 
+def cell_means(points: Array, side_m: float) -> Array:
+    """Return the mean of the points in each cube of side ``side_m`` that has any.  -> (M, 3)."""
+    x, y, z = np.floor((points - points.min(axis=0)) / side_m).T.astype(np.int64)
+    cells = (x << 42) | (y << 21) | z
+    order = np.argsort(cells, kind="stable")
+    first = np.flatnonzero(np.diff(cells[order], prepend=-1))
+    counts = np.diff(first, append=len(points))
+    return np.asarray(np.add.reduceat(points[order], first) / counts[:, None])
+
+
 def n_drawn(n_points: int, n_kept: int) -> int:
     """Return how many of ``n_points`` a draw of ``n_kept`` has; 0 is a draw of all."""
     return min(n_points, n_kept) if n_kept > 0 else n_points

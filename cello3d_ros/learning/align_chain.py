@@ -181,7 +181,10 @@ def share_on_surfaces(
     rng: np.random.Generator,
     n_points: int = _N_POINTS,
 ) -> float:
-    """Return the share of the reading within 0.1 m of the plane of a point at most 1 m away."""
+    """Return the share of the reading within 0.1 m of the plane of a point at most 1 m away.
+
+    Points whose nearest has no plane count neither way.
+    """
     rows = subsample(len(reading.points), n_points, rng)
     moved = transform(T_ref_read, reading.points[rows])
     if not np.isfinite(moved).all():
@@ -189,5 +192,7 @@ def share_on_surfaces(
     _, indices = nearest(reference.tree, moved, 1, max_distance2=_NEAR_M**2)
     near = np.flatnonzero(indices[:, 0] >= 0)
     rows = indices[near, 0]
+    is_plane = reference.normals[rows].any(axis=1)
     off = np.einsum("ij,ij->i", moved[near] - reference.points[rows], reference.normals[rows])
-    return float((np.abs(off) < _SURFACE_M).sum() / len(moved))
+    n_on = (is_plane & (np.abs(off) < _SURFACE_M)).sum()
+    return float(n_on / max(len(moved) - (~is_plane).sum(), 1))

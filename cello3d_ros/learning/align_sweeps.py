@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cello3d_ros.clouds.filters import limit_density
+from cello3d_ros.clouds.filters import cell_means
 from cello3d_ros.clouds.neighbors import KdTree, build_tree, nearest
 from cello3d_ros.clouds.shape import WIDENINGS, Cloud
 from cello3d_ros.config import CloudConfig, IcpConfig, Pipeline
@@ -75,9 +76,9 @@ def visit(
     """Register scan k to the union of its neighbours, and find the normals of its points.
 
     poses: (n, 4, 4).  neighbors: scan -> its points.  own: (N, 3), points of scan k.
-    The normals are those of all scans together, at the density of one: without the rings of its
-    pattern, and wide enough for noise.  All points of scans a few cm apart would do worse: the
-    nearest are on one band of rings, as thick as it is wide.
+    The normals are those of all scans together, from the means of their points in cells as dense
+    on a plane as the points of one scan may be.  The nearest of all points would do worse: those
+    of scans a few cm apart are on one band of rings, as thick by noise as it is wide.
     """
     if not neighbors:
         alone = ShapedScan(own, np.zeros_like(own))
@@ -100,13 +101,9 @@ def visit(
     if wants_halves and holds and len(neighbors) >= 2:
         halves = _halves(k, poses, neighbors, reading, step, icp, seed)
     points = transform(step, reading.points)
-    surface = limit_density(
-        np.concatenate([points, union.points]),
-        pipeline.cloud.voxel_m,
-        pipeline.cloud.max_points_per_voxel,
-        rng,
-    )
-    normals = common_normals(build_tree(surface), points, pipeline.cloud, n_threads)
+    side_m = pipeline.cloud.voxel_m / math.sqrt(pipeline.cloud.max_points_per_voxel)
+    surface = build_tree(cell_means(np.concatenate([points, union.points]), side_m))
+    normals = common_normals(surface, points, pipeline.cloud, n_threads)
     shaped = ShapedScan(reading.points, normals @ step[:3, :3])
     return Visit(poses[k] @ step, moved, share, holds, halves, shaped)
 

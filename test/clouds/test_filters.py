@@ -1,6 +1,6 @@
 import numpy as np
 
-from cello3d_ros.clouds.filters import crop_range, limit_density, subsample
+from cello3d_ros.clouds.filters import cell_means, crop_range, limit_density, subsample
 
 
 def test_the_range_crop_keeps_both_limits():
@@ -62,3 +62,12 @@ def test_the_draw_is_the_first_of_a_permutation_in_each_cube():
         counts[cell] = counts.get(cell := tuple(cells[i]), 0) + 1
         expected[i] = counts[cell] <= 2
     np.testing.assert_array_equal(kept, points[expected])
+
+
+def test_the_means_of_cells_are_those_of_their_points():
+    points = np.random.default_rng(3).uniform(-2.0, 9.0, (700, 3))
+    _, cells = np.unique(
+        np.floor((points - points.min(axis=0)) / 0.9), axis=0, return_inverse=True
+    )
+    expected = [points[cells.ravel() == cell].mean(axis=0) for cell in range(cells.max() + 1)]
+    np.testing.assert_allclose(cell_means(points, 0.9), expected, atol=1e-12)

@@ -9,14 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cello3d_ros.clouds.filters import cell_means
 from cello3d_ros.clouds.neighbors import build_tree
-from cello3d_ros.config import IcpConfig, Pipeline
+from cello3d_ros.clouds.shape import local_shape
+from cello3d_ros.config import CloudConfig, IcpConfig, Pipeline
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log, transform
 from cello3d_ros.learning.align import Alignment, _split, align
-from cello3d_ros.learning.align_sweeps import common_normals, neighbors_of
+from cello3d_ros.learning.align_chain import share_on_surfaces
+from cello3d_ros.learning.align_sweeps import cloud_of, common_normals, neighbors_of
+from cello3d_ros.recordings.poses import tum_line
 from cello3d_ros.recordings.recording import Scan
+from cello3d_ros.simulation.products import SCANNERS
+from cello3d_ros.simulation.simulation import Simulation
 
 N_SCANS = 7
 PIPELINE = Pipeline(icp=IcpConfig(n_reading_points=1000))
@@ -247,19 +253,53 @@ def test_neighbors_are_the_eight_keyframes_on_either_side_without_the_scan_itsel
     assert neighbors_of(0, keyframes).tolist() == [*range(3, 27, 3)]
 
 
-def test_common_normals_see_the_surface_where_one_scan_sees_a_ring() -> None:
+def test_rings_of_sixteen_beams_do_not_pull_scans_together(tmp_path: Path) -> None:
+    first = next(iter(Simulation("hall", 13, 1))).T_world_sensor
+    assert first is not None
+    truth, path = first @ true_poses(8, step_m=0.1), tmp_path / "truth.tum"
+    path.write_text("".join(tum_line((k + 1) * 10**8, T) for k, T in enumerate(truth)))
+    seen = Simulation("hall", 13, len(truth), SCANNERS["vlp16"], path)
+    scans = [Scan(stamp_ns=scan.stamp_ns, points=scan.points) for scan in seen]
+    found = align(Clouds(scans), Pipeline())
+    errors_m = step_errors(found, truth)[:, :3]
+    assert not found.reasons
+    assert np.sqrt((errors_m**2).sum(axis=1).mean()) < min(0.004, 2.0 * found.sigmas()[0])
+
+
+def angles_deg(normals: Array, axis: int) -> Array:
+    """Return the angles between normals and an axis."""
+    return np.degrees(np.arccos(np.minimum(np.abs(normals[:, axis]), 1.0)))
+
+
+def test_common_normals_see_the_wall_where_rings_of_all_scans_lie_together() -> None:
+    """Rings 0.35 m apart, of 17 scans 5 mm apart, 1.5 cm of noise across the wall."""
     rng = np.random.default_rng(0)
-    rings = [
-        np.column_stack([np.linspace(0, 2, 80), np.full(80, y), np.zeros(80)]) for y in (0, 1)
-    ]
-    own = np.concatenate(rings) + rng.normal(scale=1e-3, size=(160, 3))
-    others = np.column_stack([rng.uniform(0, 2, (4000, 2)), rng.normal(scale=1e-3, size=4000)])
-    T = exp(np.array([1.0, 2.0, 3.0, 0.4, 0.5, 0.6]))
-    tree = build_tree(own)
-    normals = common_normals(tree, build_tree(transform(T, others)), T, 10)
-    assert np.abs(normals[:, 2]).min() > 0.99
-    alone = common_normals(tree, build_tree(own + 100.0), np.eye(4), 10)
-    assert np.abs(alone[:, 2]).min() < 0.5
+    y, ring, scan = np.meshgrid(np.arange(0, 3, 0.03), 0.35 * np.arange(6), 0.005 * np.arange(17))
+    points = np.stack([np.zeros(y.size), y.ravel(), (ring + scan).ravel()], axis=1)
+    points[:, 0] = rng.normal(scale=0.015, size=y.size)
+    points[:, 1] += rng.uniform(-0.015, 0.015, y.size)
+    own = points[rng.choice(len(points), 500, replace=False)]
+    wall = common_normals(build_tree(cell_means(points, 0.1)), own, CloudConfig())
+    assert np.median(angles_deg(wall, 0)) < 2.0
+    nearest_of_all = local_shape(build_tree(points), CloudConfig().n_neighbors)[0]
+    assert np.median(angles_deg(nearest_of_all, 0)) > 8.0
+
+
+def test_points_on_a_line_have_no_common_normal() -> None:
+    rng = np.random.default_rng(1)
+    line = np.column_stack([np.linspace(0.0, 9.0, 300), np.zeros((300, 2))])
+    line += rng.normal(scale=1e-3, size=line.shape)
+    assert not common_normals(build_tree(line), line, CloudConfig()).any()
+
+
+def test_the_share_on_surfaces_leaves_out_points_without_a_plane() -> None:
+    rng = np.random.default_rng(2)
+    points = np.column_stack([rng.uniform(0.0, 5.0, (1000, 2)), np.zeros(1000)])
+    normals = np.tile([0.0, 0.0, 1.0], (1000, 1))
+    normals[points[:, 0] > 2.0] = 0.0
+    reference, reading = cloud_of(points, normals), cloud_of(points + [0.0, 0.0, 0.2])
+    assert share_on_surfaces(reading, reference, np.eye(4), rng) == 0.0
+    assert share_on_surfaces(cloud_of(points), reference, np.eye(4), rng) == 1.0
 
 
 def test_a_sensor_that_stands_still_is_found_to_stand_still() -> None:
