@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,6 +20,7 @@ from cello3d_ros.registration.icp import register
 N_BEFORE = 8  # neighbours of a scan on either side
 _N_POINTS = 8000  # of the reading
 _EVERY = 0  # reference points: all
+_CELL_M = 0.1  # side of the cells whose means make normals: docs/align.md
 _MAX_MOVE_M, _MAX_MOVE_RAD = 1.0, 0.3  # a scan that a sweep moves farther does not hold
 
 
@@ -76,9 +76,9 @@ def visit(
     """Register scan k to the union of its neighbours, and find the normals of its points.
 
     poses: (n, 4, 4).  neighbors: scan -> its points.  own: (N, 3), points of scan k.
-    The normals are those of all scans together, from the means of their points in cells as dense
-    on a plane as the points of one scan may be.  The nearest of all points would do worse: those
-    of scans a few cm apart are on one band of rings, as thick by noise as it is wide.
+    The normals are those of all scans together, from the means of their points in cells.  The
+    nearest of all points would do worse: those of scans a few cm apart are on one band of rings,
+    as thick by noise as it is wide.
     """
     if not neighbors:
         alone = ShapedScan(own, np.zeros_like(own))
@@ -101,8 +101,7 @@ def visit(
     if wants_halves and holds and len(neighbors) >= 2:
         halves = _halves(k, poses, neighbors, reading, step, icp, seed)
     points = transform(step, reading.points)
-    side_m = pipeline.cloud.voxel_m / math.sqrt(pipeline.cloud.max_points_per_voxel)
-    surface = build_tree(cell_means(np.concatenate([points, union.points]), side_m))
+    surface = build_tree(cell_means(np.concatenate([points, union.points]), _CELL_M))
     normals = common_normals(surface, points, pipeline.cloud, n_threads)
     shaped = ShapedScan(reading.points, normals @ step[:3, :3])
     return Visit(poses[k] @ step, moved, share, holds, halves, shaped)
