@@ -7,6 +7,7 @@ Of equally far points the first in the order of the tree wins.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -75,7 +76,8 @@ def nearest(
     def task(part: slice) -> None:
         search(tree.leaves, queries[part], max_distance2, distances2[part], indices[part])
 
-    parts = [slice(i, i + _CHUNK) for i in range(0, len(queries), _CHUNK)]
+    size = min(_CHUNK, WIDTH * math.ceil(len(queries) / (WIDTH * max(n_threads, 1)))) or 1
+    parts = [slice(i, i + size) for i in range(0, len(queries), size)]
     in_threads(task, parts, n_threads)
     return distances2, indices
 

@@ -186,7 +186,8 @@ class Estimator:
 
         Raises what ``judge`` raises.
         """
-        registration = register(reading, reference, T_init, self.pipeline.icp, rng)
+        icp, n_threads = self.pipeline.icp, self.settings.n_threads
+        registration = register(reading, reference, T_init, icp, rng, n_threads)
         return self.judge(reading, reference, registration, rng)
 
     def judge(

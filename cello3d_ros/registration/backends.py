@@ -54,8 +54,14 @@ def register(
     T_init: Array,
     config: IcpConfig,
     rng: np.random.Generator,
+    n_threads: int = 1,
 ) -> Registration:
-    """Register by the backend of the settings; arguments as in ``Backend``."""
+    """Register by the backend of the settings; arguments as in ``Backend``.
+
+    n_threads: of this package's ICP, of which it changes no bit.
+    """
+    if config.backend == "icp":
+        return icp.register(reading, reference, T_init, config, rng, n_threads)
     return BACKENDS[config.backend](reading, reference, T_init, config, rng)
 
 

@@ -23,14 +23,15 @@ import numpy as np
 
 from cello3d_ros.clouds.filters import subsample
 from cello3d_ros.clouds.leaves import tree_order
-from cello3d_ros.clouds.neighbors import KdTree, build_tree
+from cello3d_ros.clouds.neighbors import Indices, KdTree, build_tree, nearest
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.registration.kernels import CONVERGED, iterate
+from cello3d_ros.registration.kernels import advance, begin, finish, move, trim_limit
 from cello3d_ros.threads import in_threads
 
-REASONS = ("", "max_iterations", "singular", "too_few_points")  # three of them the kernel's
+REASONS = ("", "max_iterations", "singular", "too_few_points")
+_SLACK = 1.2  # search beyond the last trim limit, in squared distance
 
 
 class Registration(NamedTuple):
@@ -77,10 +78,12 @@ def register(
     T_init: Array,
     config: IcpConfig,
     rng: np.random.Generator,
+    n_threads: int = 1,
 ) -> Registration:
     """Register random subsamples of two clouds, drawn anew: they are part of ICP's noise.
 
     The whole reference is searched by the tree that it has; a part of it has one built.
+    n_threads changes no bit of the result.
     """
     read = subsample(len(reading.points), config.n_reading_points, rng)
     ref = subsample(len(reference.points), config.n_reference_points, rng)
@@ -90,7 +93,8 @@ def register(
     if len(ref) < len(reference.points):
         tree = build_tree(reference.points.take(ref, axis=0))
         normals = normals.take(ref.take(tree.order), axis=0)
-    return _register(reading.points.take(read, axis=0), tree, normals, T_init, config)
+    points = reading.points.take(read, axis=0)
+    return _register(points, tree, normals, T_init, config, n_threads)
 
 
 def register_many(
@@ -114,7 +118,12 @@ def register_many(
 
 
 def _register(
-    reading: Array, tree: KdTree, normals: Array, T_init: Array, config: IcpConfig
+    reading: Array,
+    tree: KdTree,
+    normals: Array,
+    T_init: Array,
+    config: IcpConfig,
+    n_threads: int = 1,
 ) -> Registration:
     """Register points, those of the reading in an order in which neighbours are near in space.
 
@@ -122,23 +131,53 @@ def _register(
     """
     if len(tree.points) < config.n_neighbors:
         return _too_few(T_init)
-    T = np.array(T_init, np.float64, order="C")
-    status, n_iterations, rms, n_kept = iterate(
-        reading,
-        tree.leaves,
-        tree.points,
-        normals,
-        tree.points.mean(axis=0),
-        T,
-        config.n_neighbors,
-        config.trim_ratio,
-        config.error_metric == "point_to_plane",
-        config.max_iterations,
-        config.n_smoothed,
-        config.rotation_epsilon_rad,
-        config.translation_epsilon_m,
-    )
-    return Registration(T, n_iterations, status == CONVERGED, REASONS[status], rms, n_kept)
+    T, mean = np.array(T_init, np.float64, order="C"), tree.points.mean(axis=0)
+    start, motion = begin(T, reading, mean), np.eye(4)  # about the mean
+    moved, queries = np.empty_like(start), np.empty_like(start)
+    steps: list[tuple[float, float]] = []  # rotation and translation
+    reason, rms, n_kept, limit2 = "max_iterations", math.nan, 0, math.inf
+    while len(steps) < config.max_iterations and reason == "max_iterations":
+        move(motion, start, mean, moved, queries)
+        distances2, indices, limit2 = _associate(tree, queries, limit2, config, n_threads)
+        associations = distances2, indices, limit2, config.error_metric == "point_to_plane"
+        ok, rotation, translation, rms, n_kept = advance(
+            moved, queries, tree.points, normals, mean, *associations, motion
+        )
+        if not ok:
+            reason = "singular"
+            continue
+        steps.append((rotation, translation))
+        if len(steps) >= config.n_smoothed and _is_still(steps[-config.n_smoothed :], config):
+            reason = ""
+    finish(motion, T, mean)
+    return Registration(T, len(steps), reason == "", reason, rms, n_kept)
+
+
+def _associate(
+    tree: KdTree, queries: Array, last_limit2: float, config: IcpConfig, n_threads: int
+) -> tuple[Array, Indices, float]:
+    """Return the neighbours of each point up to the trim limit, and that limit, squared.
+
+    The limit is the squared distance of rank ``int(k N trim_ratio)``.  Associations beyond it are
+    dropped, so they are not searched for: the search stops a little beyond the last limit and
+    leaves them infinite.  When enough are found, the found ones are the smallest of all, and the
+    rank among them is exact; when not, the search is done again without that bound.
+    """
+    k = config.n_neighbors
+    rank = min(int(k * len(queries) * config.trim_ratio), k * len(queries) - 1)
+    distances2, indices = nearest(tree, queries, k, n_threads, _SLACK * last_limit2)
+    limit2 = trim_limit(distances2, rank)
+    if not limit2 < math.inf:
+        distances2, indices = nearest(tree, queries, k, n_threads)
+        limit2 = trim_limit(distances2, rank)
+    return distances2, indices, limit2
+
+
+def _is_still(steps: list[tuple[float, float]], config: IcpConfig) -> bool:
+    """Return whether the mean of the steps is below both limits."""
+    rotation = sum(step[0] / len(steps) for step in steps)
+    translation = sum(step[1] / len(steps) for step in steps)
+    return rotation < config.rotation_epsilon_rad and translation < config.translation_epsilon_m
 
 
 def _too_few(T_init: Array) -> Registration:

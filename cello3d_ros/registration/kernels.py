@@ -6,83 +6,80 @@ import math
 
 import numpy as np
 
-from cello3d_ros.clouds.leaves import Indices, Leaves, select
-from cello3d_ros.clouds.neighbors import search
+from cello3d_ros.clouds.leaves import Indices, select
 from cello3d_ros.compiled import kernel
 from cello3d_ros.geometry.se3 import Array
 
-_SLACK = 1.2  # search beyond the last trim limit, in squared distance
-CONVERGED, MAX_ITERATIONS, SINGULAR = range(3)
+
+@kernel()
+def begin(T: Array, reading: Array, mean: Array) -> Array:
+    """Return the reading as it starts, about the mean of the reference.  (N, 3)."""
+    start = np.empty((len(reading), 3))
+    _move(T, reading, start)
+    for i in range(len(reading)):
+        for a in range(3):
+            start[i, a] -= mean[a]
+    return start
 
 
 @kernel()
-def iterate(
-    reading: Array,
-    leaves: Leaves,
+def move(motion: Array, start: Array, mean: Array, moved: Array, queries: Array) -> None:
+    """Fill the moved reading, about the mean and in the frame of the reference."""
+    _move(motion, start, moved)
+    for i in range(len(start)):
+        for a in range(3):
+            queries[i, a] = moved[i, a] + mean[a]
+
+
+@kernel()
+def trim_limit(distances2: Array, rank: int) -> float:
+    """Return the squared distance of that rank."""
+    keys = distances2.copy().ravel()
+    select(keys, np.arange(len(keys)), 0, len(keys), rank)
+    return float(keys[rank])
+
+
+@kernel()
+def advance(
+    moved: Array,
+    queries: Array,
     points: Array,
     normals: Array,
     mean: Array,
-    T: Array,
-    k: int,
-    trim_ratio: float,
+    distances2: Array,
+    indices: Indices,
+    limit2: float,
     to_plane: bool,
-    max_iterations: int,
-    n_smoothed: int,
-    rotation_epsilon: float,
-    translation_epsilon: float,
-) -> tuple[int, int, float, int]:
-    """Run ICP and move T in place; return status, iterations, residual RMS and kept count.
+    motion: Array,
+) -> tuple[bool, float, float, float, int]:
+    """Solve for one step and move ``motion`` in place by it.
 
-    leaves, points, normals: the reference, in the order of its tree; mean: of its points.
+    Returns whether it could be solved, the step's rotation and translation, RMS and kept count.
     """
-    n = len(reading)
-    start, moved, queries = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    _move(T, reading, start)
-    for i in range(n):
-        for a in range(3):
-            start[i, a] -= mean[a]
-    motion = np.zeros((4, 4))  # of the reading as it starts, about the mean
-    for a in range(4):
-        motion[a, a] = 1.0
-    distances2, indices = np.empty((n, k)), np.empty((n, k), np.int64)
-    steps = np.zeros((max_iterations, 2))  # rotation and translation
-    rms, n_kept, limit2, status = np.nan, 0, np.inf, MAX_ITERATIONS
-    n_iterations = 0
-    while n_iterations < max_iterations and status == MAX_ITERATIONS:
-        _move(motion, start, moved)
-        for i in range(n):
-            for a in range(3):
-                queries[i, a] = moved[i, a] + mean[a]
-        limit2 = _associate(queries, leaves, trim_ratio, limit2, distances2, indices)
-        if to_plane:
-            ok, step, rms, n_kept = _plane_step(
-                moved, queries, points, normals, distances2, indices, limit2
-            )
-        else:
-            ok, step, rms, n_kept = _point_step(moved, mean, points, distances2, indices, limit2)
-        if not ok:
-            status = SINGULAR
-            continue
-        last = motion
-        motion = _product(step, motion)
-        steps[n_iterations, 0] = _angle(step)
-        for a in range(3):
-            steps[n_iterations, 1] += (motion[a, 3] - last[a, 3]) ** 2
-        steps[n_iterations, 1] = math.sqrt(steps[n_iterations, 1])
-        n_iterations += 1
-        if n_iterations >= n_smoothed:
-            rotation = translation = 0.0
-            for i in range(n_iterations - n_smoothed, n_iterations):
-                rotation += steps[i, 0] / n_smoothed
-                translation += steps[i, 1] / n_smoothed
-            if rotation < rotation_epsilon and translation < translation_epsilon:
-                status = CONVERGED
+    if to_plane:
+        ok, step, rms, n_kept = _plane_step(
+            moved, queries, points, normals, distances2, indices, limit2
+        )
+    else:
+        ok, step, rms, n_kept = _point_step(moved, mean, points, distances2, indices, limit2)
+    if not ok:
+        return False, 0.0, 0.0, rms, n_kept
+    last = motion.copy()
+    motion[:] = _product(step, last)
+    translation = 0.0
+    for a in range(3):
+        translation += (motion[a, 3] - last[a, 3]) ** 2
+    return True, _angle(step), math.sqrt(translation), rms, n_kept
+
+
+@kernel()
+def finish(motion: Array, T: Array, mean: Array) -> None:
+    """Move T in place by a motion about the mean."""
     for a in range(3):
         T[a, 3] -= mean[a]
     T[:] = _product(motion, T)
     for a in range(3):
         T[a, 3] += mean[a]
-    return status, n_iterations, rms, n_kept
 
 
 @kernel()
@@ -103,30 +100,6 @@ def _product(A: Array, B: Array) -> Array:
             for a in range(4):
                 C[i, j] += A[i, a] * B[a, j]
     return C
-
-
-@kernel()
-def _associate(
-    queries: Array,
-    leaves: Leaves,
-    trim_ratio: float,
-    last_limit2: float,
-    distances2: Array,
-    indices: Indices,
-) -> float:
-    """Fill the neighbours of each point up to the trim limit, and return that limit, squared.
-
-    The limit is the squared distance of rank ``int(k N trim_ratio)``.  Associations beyond it are
-    dropped, so they are not searched for: the search stops a little beyond the last limit and
-    leaves them infinite.  When enough are found, the found ones are the smallest of all, and the
-    rank among them is exact; when not, the search is done again without that bound.
-    """
-    rank = min(int(distances2.size * trim_ratio), distances2.size - 1)
-    if search(leaves, queries, _SLACK * last_limit2, distances2, indices) <= rank:
-        search(leaves, queries, np.inf, distances2, indices)
-    keys = distances2.copy().ravel()
-    select(keys, np.arange(len(keys)), 0, len(keys), rank)
-    return float(keys[rank])
 
 
 @kernel()

@@ -172,6 +172,21 @@ def test_each_of_many_registrations_depends_on_its_own_seed_only(room):
     assert not np.array_equal(other.T_ref_read, alone.T_ref_read)
 
 
+@pytest.mark.parametrize("metric", ["point_to_plane", "point_to_point"])
+@pytest.mark.parametrize("n_threads", [2, 3, 8])
+def test_threads_change_no_bit_of_a_registration(room, n_threads, metric):
+    rng = np.random.default_rng(18)
+    reading, reference = (prepare(scan, CloudConfig(), rng) for scan in room)
+    config = IcpConfig(n_reading_points=700, error_metric=metric)
+    start = exp([0.3, -0.2, 0.1, 0.05, 0.0, 0.2])
+    one, more = (
+        register(reading, reference, start, config, np.random.default_rng(3), n)
+        for n in (1, n_threads)
+    )
+    np.testing.assert_array_equal(one.T_ref_read, more.T_ref_read)
+    assert one[1:] == more[1:]
+
+
 @pytest.mark.parametrize(("n_reading", "n_reference"), [(0, 0), (0, 1500), (500, 0), (500, 1500)])
 def test_a_registration_is_that_of_the_points_drawn(room, n_reading, n_reference):
     """0 draws all: the reference is then searched by the tree that it has, with equal results."""
