@@ -84,11 +84,16 @@ def runs_of_models(
 ) -> list[Runs]:
     """Return the same runs judged by each of some models that have one pipeline.
 
-    Starts scatter as in the sampling of the first.  Steps are compounded as independent ones, as
-    in the paper.
+    Starts scatter as in the sampling of the first.  Steps of a model of absolute covariances are
+    compounded as independent ones, as in the paper; others with the bias that neighbours share.
     """
     runs = _runs(clouds, T_world_sensor, models, n_runs, seed, n_threads)
-    return [_stacked(runs, k, T_world_sensor, independent_path) for k in range(len(models))]
+    return [
+        _stacked(
+            runs, k, T_world_sensor, independent_path if model.shape == "none" else compound_path
+        )
+        for k, model in enumerate(models)
+    ]
 
 
 def _runs(
