@@ -78,9 +78,9 @@ class CloudConfig(Section):
     min_range_m: float = _setting(0.5, "points nearer to the sensor are dropped", 0.0)
     max_range_m: float = _setting(100.0, "points farther from the sensor are dropped", 0.0)
     min_support: float = _setting(
-        0.0,
-        "against snow, rain and dust, 0.05: a point is dropped unless this share of the points in "
-        "its direction is about as far away; 0 drops none",
+        0.1,
+        "in snow, rain and dust a point is dropped unless this share of the points in its "
+        "direction is about as far away; 0 drops none",
         0.0,
         1.0,
     )
