@@ -415,7 +415,7 @@ class Config(Pipeline):
 PIPELINES = {
     "robot": Pipeline(),
     "paper": Pipeline(
-        cloud=CloudConfig(voxel_m=0.2, min_spread=0.0),
+        cloud=CloudConfig(voxel_m=0.2, min_support=0.0, min_spread=0.0),
         icp=IcpConfig(n_reading_points=2000, n_reference_points=10000),
     ),
 }
@@ -431,6 +431,7 @@ SECTIONS: dict[str, type[Any]] = {
 }
 
 PIPELINE = ("cloud", "icp", "overlap", "grid")
+UNSEEN = ("cloud", "min_support")  # what a model knows nothing of: it learned in clear weather
 _SCATTER = ("variance", "noise_m")  # of sampling: what the registrations of a model scattered by
 
 S = TypeVar("S", bound=Section)
@@ -509,6 +510,7 @@ def differences(ours: Pipeline, theirs: Pipeline) -> list[str]:
         (name, field.name)
         for name in PIPELINE
         for field in dataclasses.fields(getattr(ours, name))
+        if (name, field.name) != UNSEEN
     ]
     if isinstance(ours, Config) and isinstance(theirs, Config):
         settings += [("sampling", key) for key in _SCATTER]

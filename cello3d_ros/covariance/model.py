@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cello3d_ros.config import (
     PIPELINE,
+    UNSEEN,
     Config,
     Pipeline,
     SamplingConfig,
@@ -255,6 +256,9 @@ def load_model(name: Path | str = "general") -> Model:
     if not is_new:
         arrays |= _of_format_2(header["provenance"])
     try:
+        section, name = UNSEEN  # the default, whatever it was in training
+        if isinstance(settings := header["config"].get(section), dict):
+            settings.pop(name, None)
         config = config_from(header["config"])
         return Model(
             **arrays,
