@@ -48,7 +48,7 @@ def without_particles(points: Array, min_share: float) -> Array:
 
 def _needed(n_others: Counts, min_share: float) -> Array:
     """Return how many of the others must support a point."""
-    return np.maximum(_LEAST, min_share * n_others)
+    return np.asarray(np.maximum(_LEAST, min_share * n_others))
 
 
 def _neighbors(points: Array) -> tuple[Counts, Counts]:
