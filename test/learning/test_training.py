@@ -568,7 +568,7 @@ def test_datasets_of_different_settings_do_not_mix(tmp_path: Path) -> None:
         load_examples([one, two], ["a", "b"])
     pipeline = Pipeline(cloud=CloudConfig(voxel_m=0.3))
     three = open_dataset(tmp_path / "three", pipeline, SamplingConfig(), create=True)
-    with pytest.raises(DatasetError, match=r"cloud.voxel_m is 0.3, not 0.2"):
+    with pytest.raises(DatasetError, match=r"cloud.voxel_m is 0.3, not 0.1"):
         load_examples([one, three], ["a"])
 
 
