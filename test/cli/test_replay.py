@@ -130,10 +130,11 @@ def lines_of(out: Path) -> list[dict]:
 def test_without_odometry_the_guess_is_constant_velocity_and_ground_truth_is_not_read(
     tmp_path: Path, model: Path
 ) -> None:
+    (tmp_path / "c.yaml").write_text("node: {pairing: consecutive}")
+    words = ["--model", str(model), "--config", str(tmp_path / "c.yaml")]
     for name in ("walk", "bare"):
         bag = walk(tmp_path / name, odometry=False, truth=name == "walk")
-        out = tmp_path / f"{name}-out"
-        assert main(["replay", str(bag), "--out", str(out), "--model", str(model)]) == 0
+        assert main(["replay", str(bag), "--out", str(tmp_path / f"{name}-out"), *words]) == 0
     with_truth, without = lines_of(tmp_path / "walk-out"), lines_of(tmp_path / "bare-out")
     assert with_truth == without
     assert len(with_truth) == N

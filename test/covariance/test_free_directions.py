@@ -5,7 +5,6 @@ import pytest
 from rings import scan, to_box, to_plane, to_tunnel
 
 from cello3d_ros.clouds.shape import prepare
-from cello3d_ros.config import CloudConfig
 from cello3d_ros.covariance.estimator import Estimator
 from cello3d_ros.covariance.model import find_model, load_model
 from cello3d_ros.errors import FreeDirectionError
@@ -22,9 +21,9 @@ def estimator():
 
 def step(estimator, hit, n_beams, seed, T_init=STEP):
     """Register two scans, the second from where STEP leads."""
-    rng = np.random.default_rng(seed)
+    rng, cloud = np.random.default_rng(seed), estimator.pipeline.cloud
     reading, reference = (
-        prepare(scan(hit, T, n_beams, BEAMS[n_beams], 2 * seed + i), CloudConfig(), rng)
+        prepare(scan(hit, T, n_beams, BEAMS[n_beams], 2 * seed + i), cloud, rng)
         for i, T in enumerate((STEP, np.eye(4)))
     )
     return estimator.register(reading, reference, T_init, rng)

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from cello3d_ros.config import (
-    PIPELINES,
     CloudConfig,
     GridConfig,
     IcpConfig,
@@ -693,7 +692,7 @@ def test_the_papers_model_has_its_form_and_was_trained_on_its_seven_sequences() 
     assert model.mean_weight == 0.0
     assert model.margin == 1.0
     assert model.lost is None
-    assert model.pipeline == PIPELINES["paper"]
+    assert pipeline_name(model.pipeline) == "paper"
     assert model.n_features == 704
     assert len(model.rotations_rad) == 7
     assert {name.rsplit("-", 1)[0] for name in model.provenance["recordings"]} == {

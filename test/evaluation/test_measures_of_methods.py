@@ -246,7 +246,7 @@ def test_answers_from_clouds_stand_beside_those_of_the_dataset():
 def test_other_settings_than_the_models_are_refused():
     pipeline = Pipeline(cloud=CloudConfig(voxel_m=0.5))
     model = constant_model(np.eye(6), 3, shape="sandwich", pipeline=pipeline)
-    with pytest.raises(DatasetError, match=r"cloud.voxel_m is 0.2, not 0.5"):
+    with pytest.raises(DatasetError, match=r"cloud.voxel_m is 0.1, not 0.5"):
         from_dataset(model, some(), np.eye(6), MethodSettings())
 
 
