@@ -28,7 +28,7 @@ from cello3d_ros.reproduction.sequences import SEQUENCES
 
 Row = dict[str, Trajectory]  # by model
 
-_TITLES = {"relative": "Relative", "general": "General", "paper": "Paper's, as meant"}
+_TITLES = {"relative": "Relative", "general": "General", "paper": "Paper's"}
 _MEASURES = (
     *("length_m", "n_runs", "n_failed", "n_lost", "n_told", "error_m", "dm_translation"),
     *("error_rad", "dm_rotation", "dm_6dof", "dm_6dof_median", "coverage_95"),
