@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log, transform
 from cello3d_ros.learning.align import Alignment, _split, align
 from cello3d_ros.learning.align_chain import share_on_surfaces
+from cello3d_ros.learning.align_scans import ScanStore, ShapedScan
 from cello3d_ros.learning.align_sweeps import cloud_of, common_normals, neighbors_of
 from cello3d_ros.recordings.poses import tum_line
 from cello3d_ros.recordings.recording import Scan
@@ -300,6 +302,41 @@ def test_the_share_on_surfaces_leaves_out_points_without_a_plane() -> None:
     reference, reading = cloud_of(points, normals), cloud_of(points + [0.0, 0.0, 0.2])
     assert share_on_surfaces(reading, reference, np.eye(4), rng) == 0.0
     assert share_on_surfaces(cloud_of(points), reference, np.eye(4), rng) == 1.0
+
+
+def test_memory_holds_a_window_of_scans_however_many_there_are(tmp_path: Path) -> None:
+    store, most = ScanStore(tmp_path, 34), 0
+    rng = np.random.default_rng(4)
+    for k in range(400):
+        store.add_shaped(k, 0, ShapedScan(rng.normal(size=(50, 3)), rng.normal(size=(50, 3))))
+        most = max(most, len(store._cache))
+    assert most == 34
+    for k in range(400):  # any scan is read again, and the oldest in memory goes
+        assert store.shaped(k, 0).points.shape == (50, 3)
+        assert len(store._cache) == 34
+
+
+def test_a_long_recording_is_aligned_in_the_memory_of_a_short_one() -> None:
+    rng = np.random.default_rng(5)
+    cloud = rng.normal(size=(300, 3)) * [4.0, 3.0, 0.05] + [0.0, 0.0, 1.0]
+
+    class Long(Clouds):
+        """Scans that are made when they are read, and forgotten."""
+
+        def __iter__(self) -> Iterator[Scan]:
+            for k in range(len(self)):
+                noise = np.random.default_rng(k).normal(scale=0.005, size=cloud.shape)
+                yield Scan(stamp_ns=(k + 1) * 10**8, points=cloud + noise)
+
+    def most_bytes(n: int) -> int:
+        tracemalloc.start()
+        align(Long([None] * n), PIPELINE)  # type: ignore[list-item]
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return most
+
+    most_bytes(5)
+    assert most_bytes(100) < 1.3 * most_bytes(36)
 
 
 def test_a_sensor_that_stands_still_is_found_to_stand_still() -> None:
