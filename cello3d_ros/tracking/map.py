@@ -64,8 +64,9 @@ class Map:
         near = crop_range(near[subsample(len(near), _SPARE * n_points, rng)], 0.0, range_m)
         even = limit_density(near, config.voxel_m, config.max_points_per_voxel, rng)
         few = even[subsample(len(even), n_points, rng)]
+        every = replace(config, min_range_m=0.0, max_range_m=range_m, min_support=0.0)  # no scan
         try:
-            return prepare(few, replace(config, min_range_m=0.0, max_range_m=range_m), rng)
+            return prepare(few, every, rng)
         except CloudError as error:
             raise NoOverlapError(
                 f"the reference cloud around the guess of the sensor is too small: {error}"
