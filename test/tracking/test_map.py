@@ -60,9 +60,9 @@ def test_a_dense_map_is_thinned_to_a_bound_and_evenly() -> None:
     sparse = rng.uniform([-20, -20, 0], [0, 20, 0.1], (20_000, 3))
     dense = rng.uniform([0, -5, 0], [10, 5, 0.1], (400_000, 3))
     crowded = Map(1, np.vstack([sparse, dense]), "map")
-    few = NodeConfig(max_reference_points=10_000)
-    points = crowded.around(np.zeros(3), few, PLAIN)[0].points
+    few, coarse = NodeConfig(max_reference_points=10_000), CloudConfig(voxel_m=0.2)
+    points = crowded.around(np.zeros(3), few, coarse)[0].points
     assert 9_000 < len(points) <= 10_000
     assert (points[:, 0] > 0).sum() < 4 * (points[:, 0] < 0).sum()  # of 20 times as many
-    again = Map(1, crowded.points, "map").around(np.zeros(3), few, PLAIN)[0].points
+    again = Map(1, crowded.points, "map").around(np.zeros(3), few, coarse)[0].points
     np.testing.assert_array_equal(points, again)
