@@ -150,7 +150,9 @@ def by_localization(Q: Array, run: Heard, noise: Noise) -> tuple[Array, Array]:
     x[:6] = _euler(run.truth[:1])[0]
     x[6:12] = log(inverse(run.truth[0]) @ run.truth[1]) / run.times_s[1]
     found = list(localized(Q, measured, x))[N_IMU - 1 :: N_IMU]
-    return np.array([p for p, _ in found]) - _euler(run.truth[1:]), np.array([P for _, P in found])
+    errors = np.array([p for p, _ in found]) - _euler(run.truth[1:])
+    errors[:, 3:] = (errors[:, 3:] + np.pi) % (2.0 * np.pi) - np.pi
+    return errors, np.array([P for _, P in found])
 
 
 def _euler(T: Array) -> Array:
