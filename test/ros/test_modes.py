@@ -6,37 +6,23 @@ import math
 import numpy as np
 import pytest
 from consumer_rules import of_pose, of_twist
+from room_walks import InMemory, walk_in_a_room
 
 from cello3d_ros.config import NodeConfig
 from cello3d_ros.covariance.lost import Lost
 from cello3d_ros.covariance.model import load_model, save_model, shipped_model_path
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import to_fixed_axes
-from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.ros import markers, replay
 from cello3d_ros.ros.process import NodeProcess
-from cello3d_ros.tracking.warmup import room
 
 MODES = NodeConfig.__dataclass_fields__["covariance_mode"].metadata["choices"]
 STEP_S = 0.2
 
 
-class InMemory(list):
-    """Scans as a recording."""
-
-    name = "in memory"
-
-
 @pytest.fixture(scope="module")
 def recording() -> InMemory:
-    rng = np.random.default_rng(3)
-    scans = InMemory()
-    for i in range(4):
-        T = se3.exp(np.array([0.15, 0.05, 0.01, 0.01, -0.02, 0.06]) * i)
-        stamp_ns = 10**18 + i * round(STEP_S * 1e9)
-        points = se3.transform(se3.inverse(T), room(rng))
-        scans.append(Scan(stamp_ns=stamp_ns, points=points, T_world_sensor=T, T_odom_sensor=T))
-    return scans
+    return walk_in_a_room(4, STEP_S)
 
 
 def played(tmp_path, domain_id, recording, **settings):

@@ -4,37 +4,22 @@ import itertools
 
 import numpy as np
 import pytest
+from room_walks import InMemory, walk_in_a_room
 
 from cello3d_ros.geometry import se3
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.ros import messages, replay
 
 
-class InMemory(list):
-    """Scans as a recording."""
-
-    name = "in memory"
-
-
 @pytest.fixture(scope="module")
 def recording() -> InMemory:
     """Ten scans of a room, with odometry that is a little wrong."""
-    from cello3d_ros.tracking.warmup import room
+    start = se3.exp([5.0, 1.0, 0.0, 0.0, 0.0, 2.0])
 
-    rng = np.random.default_rng(3)
-    scans = InMemory()
-    for i in range(10):
-        T = se3.exp(np.array([0.15, 0.05, 0.01, 0.01, -0.02, 0.06]) * i)
-        drift = se3.exp(np.array([0.004, -0.003, 0, 0, 0, 0.002]) * i)
-        scans.append(
-            Scan(
-                stamp_ns=10**18 + i * 200_000_000,
-                points=se3.transform(se3.inverse(T), room(rng)),
-                T_world_sensor=T,
-                T_odom_sensor=se3.exp([5.0, 1.0, 0.0, 0.0, 0.0, 2.0]) @ T @ drift,
-            )
-        )
-    return scans
+    def odometry(T, i):
+        return start @ T @ se3.exp(np.array([0.004, -0.003, 0, 0, 0, 0.002]) * i)
+
+    return walk_in_a_room(10, 0.2, odometry)
 
 
 @pytest.fixture(scope="module")

@@ -2,39 +2,19 @@
 
 import numpy as np
 import pytest
+from room_walks import InMemory, walk_in_a_room
 
 from cello3d_ros.covariance.estimator import Estimator
 from cello3d_ros.covariance.model import load_model
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import is_positive_definite
-from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.ros import messages, replay
 from cello3d_ros.ros.process import NodeProcess
-from cello3d_ros.tracking.warmup import room
-
-
-class InMemory(list):
-    """Scans as a recording."""
-
-    name = "in memory"
 
 
 @pytest.fixture(scope="module")
 def recording() -> InMemory:
-    rng = np.random.default_rng(3)
-    scans = InMemory()
-    for i in range(4):
-        T = se3.exp(np.array([0.15, 0.05, 0.01, 0.01, -0.02, 0.06]) * i)
-        points = se3.transform(se3.inverse(T), room(rng, 8000))
-        scans.append(
-            Scan(
-                stamp_ns=10**18 + i * 400_000_000,
-                points=points,
-                T_world_sensor=T,
-                T_odom_sensor=T,
-            )
-        )
-    return scans
+    return walk_in_a_room(4, 0.4, n_points=8000)
 
 
 def test_the_node_answers_with_the_papers_model_as_python_does(
