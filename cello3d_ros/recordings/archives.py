@@ -65,11 +65,11 @@ def _check_member(archive: Path, member: zipfile.ZipInfo) -> None:
     name = PurePosixPath(member.filename.replace("\\", "/"))
     if name.is_absolute() or ".." in name.parts or ":" in name.parts[0]:
         raise RecordingError(f"{archive}: holds {member.filename!r}, a path out of the archive")
-    if member.file_size > _MAX_BYTES:
-        raise RecordingError(f"{archive}: {member.filename} declares {member.file_size} bytes")
 
 
 def _read_member(archive: Path, member: zipfile.ZipInfo) -> bytes:
+    if member.file_size > _MAX_BYTES:
+        raise RecordingError(f"{archive}: {member.filename} declares {member.file_size} bytes")
     with _one_sentence(archive, f"{member.filename}: "), zipfile.ZipFile(archive) as opened:
         return opened.read(member)
 

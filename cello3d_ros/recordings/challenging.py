@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import NamedTuple
@@ -38,14 +39,13 @@ SEQUENCES = MappingProxyType(
     }
 )
 _POSES = "pose_scanner_leica.csv"
-_POSE_FOLDERS = ("csv_global", "global_frame", "leica", "")
 _LOCAL, _GLOBAL = re.compile(r"Hokuyo_(\d+)\.csv$"), re.compile(r"PointCloud(\d+)\.csv$")
 _MATRIX = [f"t{i}{j}" for i in range(4) for j in range(4)]
 
 
 def sequence_of(name: str) -> str | None:
     """Return which of the eight sequences a folder or archive is called after, or None."""
-    words = "_" + re.sub(r"[^a-z]+", "_", name.lower()) + "_"
+    words = f"_{re.sub(r'[^a-z]+', '_', name.lower())}_".replace("_in_", "_")
     return next((full for key, full in SEQUENCES.items() if f"_{key}_" in words), None)
 
 
@@ -62,9 +62,9 @@ class ChallengingRecording:
     """Scans of one sequence, in integer order, with the poses that the theodolite measured.
 
     In any folder of the tree ``Hokuyo_<i>.csv`` (sensor frame; preferred) or ``PointCloud<i>.csv``
-    (world frame, moved back by the pose), and ``pose_scanner_leica.csv`` beside them or in
-    ``csv_global/``, ``global_frame/`` or ``leica/``; everything may lie in zip archives.  Poses
-    are found by poseId, by row where ids and numbers of files differ.
+    (world frame, moved back by the pose), and ``pose_scanner_leica.csv``, the one that is nearest
+    to them; everything may lie in zip archives.  Poses are found by poseId, by row where ids and
+    numbers of files differ.
     """
 
     has_odometry = False
@@ -135,9 +135,12 @@ class ChallengingRecording:
         return Scan(**{**vars(scan), "T_world_sensor": T})
 
     def _read_poses(self, beside: PurePosixPath) -> _PoseFile | None:
-        folders = [beside, *(base / f for f in _POSE_FOLDERS for base in (beside, beside.parent))]
-        name = next((n for f in folders if (n := str(f / _POSES)) in self._files.names), None)
-        return None if name is None else _read_pose_file(self._files, name)
+        """Read the poses whose file shares most of its path with the clouds', None without."""
+        names = [name for name in self._files.names if PurePosixPath(name).name == _POSES]
+        if not names:
+            return None
+        nearest = min(names, key=lambda name: (-_n_shared(PurePosixPath(name), beside), name))
+        return _read_pose_file(self._files, nearest)
 
     def _matched(self) -> list[int | None]:
         """Return the row of each cloud's pose."""
@@ -178,6 +181,12 @@ def _clouds(files: Files) -> tuple[bool, dict[int, str]]:
         if folders:
             return pattern is _LOCAL, next(iter(folders.values()))
     return True, {}
+
+
+def _n_shared(name: PurePosixPath, folder: PurePosixPath) -> int:
+    """Return how many folders a file lies in, from the top, that a folder lies in as well."""
+    pairs = zip(name.parent.parts, folder.parts, strict=False)
+    return sum(1 for _ in takewhile(lambda ab: ab[0] == ab[1], pairs))
 
 
 def _read_pose_file(files: Files, name: str) -> _PoseFile:

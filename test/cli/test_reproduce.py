@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,8 @@ def sequence(folder: Path, name: str, seed: int) -> Path:
     rng = np.random.default_rng(seed)
     boxes = [(np.zeros(3), np.array([8.0, 6.0, 3.0]) + rng.uniform(0, 1, 3))]
     boxes += [(rng.uniform(-2, 2, 3), rng.uniform(0.5, 1.5, 3)) for _ in range(3)]
-    (folder / name / "csv_local").mkdir(parents=True)
+    for part in ("csv_local", "leica"):
+        (folder / name / part).mkdir(parents=True)
     names = ["poseId", "timestamp", *(f"T{i}{j}" for i in range(4) for j in range(4))]
     rows = [",".join(names)]
     for k in range(N_SCANS):
@@ -48,16 +50,20 @@ def sequence(folder: Path, name: str, seed: int) -> Path:
         lines = [",".join(map(str, [1e9 + k, *point])) for point in scan.round(5).tolist()]
         text = "\n".join(["Time_in_sec,x,y,z", *lines]) + "\n"
         (folder / name / "csv_local" / f"Hokuyo_{k}.csv").write_text(text)
-    poses = folder / name / "csv_local" / "pose_scanner_leica.csv"
+    poses = folder / name / "leica" / "pose_scanner_leica.csv"
     poses.write_text("\n".join(rows) + "\n")
     return folder
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data")
-    sequence(folder, "gazebo_summer_20110824", 1)
-    return sequence(folder, "gazebo_winter_20120118", 2)
+    """One sequence as a folder and one as the archive that is downloaded."""
+    folder, apart = tmp_path_factory.mktemp("data"), tmp_path_factory.mktemp("apart")
+    sequence(folder, "Gazebo_in_summer", 1)
+    winter = "gazebo_winter_18-Jan-2012-16_10_04"
+    sequence(apart, winter, 2)
+    shutil.make_archive(str(folder / winter), "zip", apart, winter)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +98,7 @@ def test_tables_on_the_papers_own_format(
         out / "datasets-recorded" / "models" / "gazebo_summer-0-paper.npz"
     ).provenance
     trained_on = {name.split(" part ")[0] for name in provenance["recordings"]}
-    assert trained_on == {"gazebo_winter_20120118"}  # never what is tested
+    assert trained_on == {"gazebo_winter_18-Jan-2012-16_10_04"}  # never what is tested
     pairs = sorted((out / "datasets-recorded").glob("*/pairs/*.npz"))
     times = [path.stat().st_mtime_ns for path in pairs]
     assert len(pairs) == 12

@@ -10,7 +10,7 @@ import pytest
 
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry import se3
-from cello3d_ros.recordings import open_recording
+from cello3d_ros.recordings import archives, open_recording
 from cello3d_ros.recordings.challenging import SEQUENCES, ChallengingRecording, sequence_of
 
 pytestmark = pytest.mark.skipif(find_spec("pyarrow") is None, reason="PyArrow is not installed")
@@ -119,6 +119,40 @@ def test_archives_in_a_folder_count_as_unpacked(tmp_path: Path) -> None:
     check(open_recording(folder))
 
 
+@pytest.mark.parametrize("inside", [True, False])
+def test_archives_of_one_frame_each_give_the_poses_of_the_other(
+    tmp_path: Path, inside: bool
+) -> None:
+    folder = sequence(tmp_path / "stairs_26-Aug-2011-14_26_14")
+    for part, frame in (("csv_local", "local_frame"), ("csv_global", "global_frame")):
+        (folder / part).rename(tmp_path / frame)
+        (folder / part).mkdir()
+        root = (tmp_path, frame) if inside else (tmp_path / frame,)
+        shutil.make_archive(str(folder / part / frame), "zip", *root)
+    check(open_recording(folder))
+
+
+def test_the_nearest_poses_count(tmp_path: Path) -> None:
+    folder = sequence(tmp_path / "apartment", "leica")
+    other = folder / "csv_local" / "pose_scanner_leica.csv"
+    shutil.move(folder / "leica" / "pose_scanner_leica.csv", other)
+    (folder / "leica" / "pose_scanner_leica.csv").write_text(pose_text(T @ T[0]))
+    check(open_recording(folder))
+
+
+def test_only_what_is_read_of_an_archive_may_not_be_large(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = sequence(tmp_path / "plain_01-Sep-2011-16_39_18", "leica")
+    monkeypatch.setattr(archives, "_MAX_BYTES", 20_000)
+    (folder / "raw.bag").write_bytes(bytes(30_000))
+    archive = shutil.make_archive(str(tmp_path / "plain"), "zip", tmp_path, folder.name)
+    check(open_recording(Path(archive)))
+    monkeypatch.setattr(archives, "_MAX_BYTES", 1000)
+    with pytest.raises(RecordingError, match=r"leica\.csv declares \d+ bytes"):
+        open_recording(Path(archive))
+
+
 def test_all_eight_sequences_are_known_by_name() -> None:
     names = {
         "apartment_03-Aug-2011-18_13_33": "Apartment",
@@ -127,6 +161,10 @@ def test_all_eight_sequences_are_known_by_name() -> None:
         "ETH": "ETH Hauptgebaude",
         "gazebo_summer_04-Aug-2011-16_13_22.zip": "Gazebo in summer",
         "Gazebo Winter": "Gazebo in winter",
+        "Wood_in_summer": "Wood in summer",
+        "Gazebo in winter.zip": "Gazebo in winter",
+        "ETH_Hauptgebaude": "ETH Hauptgebaude",
+        "Mountain_plain": "Mountain plain",
         "plain_01-Sep-2011-16_39_18": "Mountain plain",
         "wood-summer": "Wood in summer",
         "wood_autumn_09-Dec-2011-15_44_05": "Wood in autumn",
