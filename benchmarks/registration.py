@@ -25,7 +25,8 @@ from cello3d_ros.clouds.neighbors import build_tree, search
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import exp, transform
 from cello3d_ros.registration import kernels
-from cello3d_ros.registration.icp import icp, register_many
+from cello3d_ros.registration.backends import register_many
+from cello3d_ros.registration.icp import icp
 
 _CONFIG = IcpConfig()
 

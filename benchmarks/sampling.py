@@ -23,7 +23,7 @@ from cello3d_ros.clouds.neighbors import build_tree
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import exp
-from cello3d_ros.registration.icp import register_many
+from cello3d_ros.registration.backends import register_many
 
 
 def main() -> None:

@@ -98,3 +98,11 @@ class Robot:
             assert not complaints(pose.T.ravel(), pose.C)
         for message in replay.odometry.values():
             assert not [*of_pose(message), *of_twist(message)]
+
+
+def ellipsoid_of(marker: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return centre (3,) and (3, 3) matrix A of a SPHERE: its surface is ``centre + A e``."""
+    p, q = marker.pose.position, marker.pose.orientation
+    R = se3.pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))[:3, :3]
+    diameters = np.array([marker.scale.x, marker.scale.y, marker.scale.z])
+    return np.array([p.x, p.y, p.z]), R * (0.5 * diameters)

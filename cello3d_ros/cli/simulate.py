@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the bags.  Raises RecordingError if a name is taken or embreex is missing."""
-    from cello3d_ros.recordings.bag_writer import write_bag
+    from cello3d_ros.recordings.bag_writer import ODOMETRY_PER_SCAN, write_bag
 
     scanner, drive = _configured(arguments)
     n_seeds = 1 if arguments.seeds is None else arguments.seeds
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> None:
         out = arguments.out if arguments.seeds is None else arguments.out / simulation.name
         progress = with_progress(simulation, len(simulation), simulation.name)
         provenance = {"made_by": _command(arguments, seed), KEY: told(simulation)}
-        odometry = None if drive is None else simulation.track()
+        odometry = ODOMETRY_PER_SCAN if drive is None else simulation.track()
         write_bag(out, progress, odometry=odometry, provenance=provenance)
         print(f"{out}: {len(simulation)} scans of {simulation.name}")
 

@@ -137,24 +137,17 @@ def recognise(
     The origin: the stamp where the times are within two scans of it, then the clock of the
     stamps where they are within two scans of that, else the first point.
     """
-    known = _signed(values)
-    known = known[np.isfinite(known)]
-    if len(known) == 0:
-        raise PointTimesError("no point has a finite time")
-    base = known[0]
-    low, middle, high = np.quantile((known - base).astype(np.float64), [0.005, 0.5, 0.995])
-    if low == high:
-        raise PointTimesError("all points of a cloud have the same time")
+    base, middle, span = _extent(values)
 
     def after_stamp_ns(ns: int) -> float:
-        return _exact_ns(base, ns, stamp_ns) + ns * float(middle)
+        return _exact_ns(base, ns, stamp_ns) + ns * middle
 
-    span = float(high - low)
-    near = [n for n in UNITS.values() if abs(after_stamp_ns(n)) < _NEAR_NS]
-    candidates = near if stamp_ns > _EARLIEST_NS else []
-    candidates = candidates or _units(span, values.dtype.kind == "f", period_s)
     if unit is not None:
         candidates = [UNITS[unit]]
+    else:
+        near = [n for n in UNITS.values() if abs(after_stamp_ns(n)) < _NEAR_NS]
+        candidates = near if stamp_ns > _EARLIEST_NS else []
+        candidates = candidates or _units(span, values.dtype.kind == "f", period_s)
     if not candidates or 1e-9 * candidates[0] * span > _longest_s(period_s):
         raise PointTimesError(
             f"the times of the points span {span:g}, no scan in any unit"
@@ -163,7 +156,7 @@ def recognise(
         )
     ns = candidates[0]
     reach_s = 2.0 * max(period_s or 0.0, 1e-9 * ns * span, _SHORTEST_S)
-    if abs(1e-9 * ns * (float(base) + float(middle))) <= reach_s:
+    if abs(1e-9 * ns * (float(base) + middle)) <= reach_s:
         return TimeLaw(ns, STAMP, reach_s)
     return TimeLaw(ns, EPOCH if abs(1e-9 * after_stamp_ns(ns)) <= reach_s else FIRST, reach_s)
 
@@ -220,6 +213,21 @@ def relative_s(values: NDArray[Any], law: TimeLaw, stamp_ns: int) -> Array:
     with np.errstate(invalid="ignore"):
         time_s[~(np.abs(time_s - middle) <= law.reach_s)] = np.nan
     return time_s - np.nanmin(time_s) if law.origin == FIRST else time_s
+
+
+def _extent(values: NDArray[Any]) -> tuple[Any, float, float]:
+    """Return the first time, how long after it the middle is, and the span of 99 % of all.
+
+    Raises PointTimesError where there is no span.
+    """
+    known = _signed(values)
+    known = known[np.isfinite(known)]
+    if len(known) == 0:
+        raise PointTimesError("no point has a finite time")
+    low, middle, high = np.quantile((known - known[0]).astype(np.float64), [0.005, 0.5, 0.995])
+    if low == high:
+        raise PointTimesError("all points of a cloud have the same time")
+    return known[0], float(middle), float(high - low)
 
 
 def _signed(values: NDArray[Any]) -> NDArray[Any]:

@@ -37,51 +37,29 @@ def n_features(grid: GridConfig) -> int:
     return int(np.prod(grid.n_cells)) * N_CELL
 
 
-def describe_overlap(
-    points: Array, normals: Array, planarity: Array, cylindricality: Array, grid: GridConfig
-) -> Array:
-    """Return the descriptor of overlapping points, cell by cell, x-major.
-
-    points, normals: (N, 3) of both clouds in the reading frame; planarity, cylindricality: (N,).
-    Returns (n_features,): for each cell the mean planarity, the mean cylindricality and the
-    normalised histogram of unsigned normals; zeros for an empty cell.  Cells are half-open, the
-    grid is centred on the origin and points outside it are ignored.  Source: Sec. IV-C and V-A.
-    """
-    every = np.ones(len(points), np.bool_)
-    return _describe([(points, normals, planarity, cylindricality, every)], [np.eye(4)], grid)
-
-
 def describe_clouds(
     clouds: Sequence[Cloud],
     overlaps: Sequence[NDArray[np.bool_]],
     Ts: Sequence[Array],
     grid: GridConfig,
 ) -> Array:
-    """Return the same of those points of some clouds that overlap.
+    """Return the descriptor of those points of some clouds that overlap, cell by cell, x-major.
 
     overlaps: (N,) of each cloud; Ts: (4, 4), each takes its cloud to the reading frame, or to a
-    turned one.
+    turned one.  Returns (n_features,): for each cell the mean planarity, the mean cylindricality
+    and the normalised histogram of unsigned normals; zeros for an empty cell.  Cells are
+    half-open, the grid is centred on the origin and points outside it are ignored.
+    Source: Sec. IV-C and V-A.
     """
     assert all(has_shape(cloud) for cloud in clouds)
-    parts = [
-        (cloud.points, cloud.normals, cloud.planarity, cloud.cylindricality, overlap)
-        for cloud, overlap in zip(clouds, overlaps)
-    ]
-    return _describe(parts, Ts, grid)
-
-
-def _describe(
-    parts: Sequence[tuple[Array, Array, Array, Array, NDArray[np.bool_]]],
-    Ts: Sequence[Array],
-    grid: GridConfig,
-) -> Array:
     n_cells = np.array(grid.n_cells)
     extent = np.array(grid.extent_m)
     sums = np.zeros((int(n_cells.prod()), N_CELL))
     counts = np.zeros(len(sums))
-    for part, T in zip(parts, Ts):
+    for cloud, overlap, T in zip(clouds, overlaps, Ts):
+        of_points = cloud.points, cloud.normals, cloud.planarity, cloud.cylindricality, overlap
         T = np.array(T, np.float64, order="C")
-        _sum_cells(*part, T, n_cells, extent, BINS, sums, counts)
+        _sum_cells(*of_points, T, n_cells, extent, BINS, sums, counts)
     return (sums / np.maximum(counts, 1.0)[:, None]).ravel()
 
 

@@ -68,14 +68,12 @@ def sampled_covariance(xi: ArrayLike, centre: ArrayLike | None = None) -> Array:
 
 
 def to_left(T: ArrayLike, Y: ArrayLike) -> Array:
-    """Return ``Ad(T) Y Ad(T)^T``: the left covariance of a right one.  (..., 6, 6)."""
+    """Return ``Ad(T) Y Ad(T)^T``: the left covariance of a right one.  (..., 6, 6).
+
+    ``to_left(inverse(T), Y)`` is the right covariance of a left one.
+    """
     Ad = adjoint(T)
     return symmetrized(Ad @ np.asarray(Y, dtype=np.float64) @ _transposed(Ad))
-
-
-def to_right(T: ArrayLike, Y: ArrayLike) -> Array:
-    """Return ``Ad(T)^-1 Y Ad(T)^-T``: the right covariance of a left one.  (..., 6, 6)."""
-    return to_left(inverse(T), Y)
 
 
 def to_fixed_axes(R: ArrayLike, Y: ArrayLike) -> Array:

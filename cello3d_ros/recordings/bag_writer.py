@@ -41,14 +41,14 @@ __all__ = ["CLOUD_TYPE", "GROUND_TRUTH", "ODOMETRY", "ODOMETRY_TYPE", "POINTS", 
 
 _FOREVER = QosTime(9223372036, 854775807)
 _LATCHED = {TF_STATIC}
+ODOMETRY_PER_SCAN = 10
 
 
 def write_bag(
     path: Path | str,
     scans: Iterable[Scan],
     *,
-    odometry_per_scan: int = 10,
-    odometry: PoseTrack | None = None,
+    odometry: int | PoseTrack = ODOMETRY_PER_SCAN,
     provenance: Mapping[str, str] | None = None,
     storage: str = "mcap",
     double: bool = False,
@@ -58,8 +58,8 @@ def write_bag(
     ``/points`` is PointCloud2 (float32 x, y, z, ...; frame ``lidar``); ``/odom`` and
     ``/ground_truth`` are Odometry of ``lidar`` in ``odom`` and ``map``, left out where a scan has
     none.  Their covariances are 0: unknown.  ``/odom`` has a message at each cloud's stamp, just
-    before the cloud, and interpolated ones between: ``odometry_per_scan`` an interval in all, or
-    those of the track ``odometry``, which may begin before the first scan.
+    before the cloud, and others between: ``odometry`` an interval in all, interpolated, or those
+    of a track, which may begin before the first scan.
     ``/tf`` has map -> odom -> base_link (without odometry map -> base_link), ``/tf_static``
     base_link -> lidar, the identity.
 
@@ -70,7 +70,7 @@ def write_bag(
     """
     path = Path(path)
     counts = {POINTS: 0}
-    messages = _messages(scans, odometry_per_scan if odometry is None else odometry, double)
+    messages = _messages(scans, odometry, double)
     with new_folder(path) as folder:
         write_messages(folder, _counted(messages, counts), provenance or {}, storage)
         if not counts[POINTS]:

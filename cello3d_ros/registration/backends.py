@@ -33,9 +33,10 @@ _SMALL_GICP_NEIGHBORS = 20  # of the covariance of a point of the subsample
 class Backend(Protocol):
     """One registration of random subsamples of two clouds.
 
-    T_init: (4, 4), the first guess of T_ref_read.  Never raises on geometry: a registration
-    without an answer keeps T_init and says why.  ``n_iterations`` is 0 where a library does not
-    tell it.  Raises ConfigError where the library is not installed.
+    T_init: (4, 4), the first guess of T_ref_read; n_threads: at most as many, which changes no
+    bit (other libraries use one).  Never raises on geometry: a registration without an answer
+    keeps T_init and says why.  ``n_iterations`` is 0 where a library does not tell it.  Raises
+    ConfigError where the library is not installed.
     """
 
     def __call__(
@@ -45,6 +46,7 @@ class Backend(Protocol):
         T_init: Array,
         config: IcpConfig,
         rng: np.random.Generator,
+        n_threads: int = 1,
     ) -> Registration: ...
 
 
@@ -56,13 +58,8 @@ def register(
     rng: np.random.Generator,
     n_threads: int = 1,
 ) -> Registration:
-    """Register by the backend of the settings; arguments as in ``Backend``.
-
-    n_threads: of this package's ICP, of which it changes no bit.
-    """
-    if config.backend == "icp":
-        return icp.register(reading, reference, T_init, config, rng, n_threads)
-    return BACKENDS[config.backend](reading, reference, T_init, config, rng)
+    """Register by the backend of the settings; arguments as in ``Backend``."""
+    return BACKENDS[config.backend](reading, reference, T_init, config, rng, n_threads)
 
 
 def check_installed(config: IcpConfig) -> None:
@@ -86,8 +83,6 @@ def register_many(
     T_inits: (n, 4, 4); seeds: n seeds of numpy's default generator.  Each result depends on its
     own start and seed only, hence not on the number of threads.
     """
-    if config.backend == "icp":
-        return icp.register_many(reading, reference, T_inits, seeds, config, n_threads)
 
     def one(k: int) -> Registration:
         return register(reading, reference, T_inits[k], config, np.random.default_rng(seeds[k]))
@@ -96,12 +91,12 @@ def register_many(
 
 
 def _open3d(
-    method: str,
     reading: Cloud,
     reference: Cloud,
     T_init: Array,
     config: IcpConfig,
     rng: np.random.Generator,
+    n_threads: int = 1,
 ) -> Registration:
     """Register by Open3D's point-to-plane ICP or generalized ICP, with the clouds' own normals.
 
@@ -110,13 +105,11 @@ def _open3d(
     """
     o3d = _imported("open3d", "Open3D", "open3d", config)
     o3c = o3d.pipelines.registration
-    if method == "gicp":
-        function, kind = (
-            o3c.registration_generalized_icp,
-            "TransformationEstimationForGeneralizedICP",
-        )
+    if config.backend == "open3d_gicp":
+        function = o3c.registration_generalized_icp
+        kind = o3c.TransformationEstimationForGeneralizedICP
     else:
-        function, kind = o3c.registration_icp, "TransformationEstimationPointToPlane"
+        function, kind = o3c.registration_icp, o3c.TransformationEstimationPointToPlane
     clouds = [
         _open3d_cloud(o3d, cloud.points[kept], cloud.normals[kept])
         for cloud, kept in zip((reading, reference), _subsamples(reading, reference, config, rng))
@@ -124,7 +117,7 @@ def _open3d(
 
     def run(T: Array, n: int) -> Any:
         criteria = o3c.ICPConvergenceCriteria(max_iteration=n)
-        return function(*clouds, config.max_distance_m, T, getattr(o3c, kind)(), criteria)
+        return function(*clouds, config.max_distance_m, T, kind(), criteria)
 
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         try:
@@ -133,12 +126,16 @@ def _open3d(
             T_next = np.array(run(T_found, 1).transformation)
         except RuntimeError:  # Open3D's error for a system that it cannot solve
             return _failed(T_init, "singular")
-    step = inverse(T_found) @ T_next
-    angle = math.acos(min(1.0, max(-1.0, (np.trace(step[:3, :3]) - 1.0) / 2.0)))
-    small = angle < config.rotation_epsilon_rad
-    small &= bool(np.linalg.norm(step[:3, 3]) < config.translation_epsilon_m)
+    converged = _is_small(inverse(T_found) @ T_next, config)
     n_associations = len(found.correspondence_set)
-    return _checked(T_init, T_found, 0, small, found.inlier_rmse, n_associations)
+    return _checked(T_init, T_found, 0, converged, found.inlier_rmse, n_associations)
+
+
+def _is_small(step: Array, config: IcpConfig) -> bool:
+    """Return whether a step is below the limits of the settings.  step: (4, 4)."""
+    angle = math.acos(min(1.0, max(-1.0, (np.trace(step[:3, :3]) - 1.0) / 2.0)))
+    shift = float(np.linalg.norm(step[:3, 3]))
+    return angle < config.rotation_epsilon_rad and shift < config.translation_epsilon_m
 
 
 def _small_gicp(
@@ -147,6 +144,7 @@ def _small_gicp(
     T_init: Array,
     config: IcpConfig,
     rng: np.random.Generator,
+    n_threads: int = 1,
 ) -> Registration:
     """Register by small_gicp's generalized ICP, each point's covariance from the subsample."""
     small_gicp = _imported("small_gicp", "small_gicp", "small_gicp", config)
@@ -217,31 +215,11 @@ def _imported(module: str, title: str, extra: str, config: IcpConfig) -> Any:
         ) from None
 
 
-def _open3d_point_to_plane(
-    reading: Cloud,
-    reference: Cloud,
-    T_init: Array,
-    config: IcpConfig,
-    rng: np.random.Generator,
-) -> Registration:
-    return _open3d("point_to_plane", reading, reference, T_init, config, rng)
-
-
-def _open3d_gicp(
-    reading: Cloud,
-    reference: Cloud,
-    T_init: Array,
-    config: IcpConfig,
-    rng: np.random.Generator,
-) -> Registration:
-    return _open3d("gicp", reading, reference, T_init, config, rng)
-
-
 BACKENDS: Mapping[str, Backend] = MappingProxyType(
     {
         "icp": icp.register,
-        "open3d_point_to_plane": _open3d_point_to_plane,
-        "open3d_gicp": _open3d_gicp,
+        "open3d_point_to_plane": _open3d,
+        "open3d_gicp": _open3d,
         "small_gicp": _small_gicp,
     }
 )

@@ -16,7 +16,6 @@ The rules are those of libpointmatcher, so that results can be compared number b
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,9 +27,7 @@ from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.kernels import advance, begin, finish, move, trim_limit
-from cello3d_ros.threads import in_threads
 
-REASONS = ("", "max_iterations", "singular", "too_few_points")
 _SLACK = 1.2  # search beyond the last trim limit, in squared distance
 
 
@@ -38,8 +35,9 @@ class Registration(NamedTuple):
     """What one run of ICP found.
 
     T_ref_read: (4, 4), p_ref = T_ref_read p_read; n_iterations: steps taken; converged: whether
-    the steps became small; reason: why not ("" or one of ``REASONS``); residual_rms_m: root mean
-    square of the kept associations' errors at the last step; n_associations: how many were kept.
+    the steps became small; reason: why not ("max_iterations", "singular", "too_few_points" or "");
+    residual_rms_m: root mean square of the kept associations' errors at the last step;
+    n_associations: how many were kept.
     """
 
     T_ref_read: Array
@@ -95,26 +93,6 @@ def register(
         normals = normals.take(ref.take(tree.order), axis=0)
     points = reading.points.take(read, axis=0)
     return _register(points, tree, normals, T_init, config, n_threads)
-
-
-def register_many(
-    reading: Cloud,
-    reference: Cloud,
-    T_inits: Array,
-    seeds: Sequence[Sequence[int]],
-    config: IcpConfig,
-    n_threads: int = 1,
-) -> list[Registration]:
-    """Register from many starts, each with subsamples of its own, as ``register`` does.
-
-    T_inits: (n, 4, 4); seeds: n seeds of numpy's default generator.  Each result depends on its
-    own start and seed only, hence not on the number of threads.
-    """
-
-    def one(i: int) -> Registration:
-        return register(reading, reference, T_inits[i], config, np.random.default_rng(seeds[i]))
-
-    return in_threads(one, range(len(T_inits)), n_threads)
 
 
 def _register(

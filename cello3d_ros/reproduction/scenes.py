@@ -12,7 +12,7 @@ from cello3d_ros.config import Pipeline, SamplingConfig
 from cello3d_ros.covariance.closed_form import censi
 from cello3d_ros.geometry.se3 import Array, exp, log
 from cello3d_ros.learning.clustering import nearest_cluster
-from cello3d_ros.registration.icp import register_many
+from cello3d_ros.registration.backends import register_many
 from cello3d_ros.registration.overlap import find_overlap
 from cello3d_ros.reproduction.datasets import PAPER
 

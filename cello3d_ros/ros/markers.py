@@ -10,13 +10,12 @@ accumulated pose.  All stand at the accumulated pose, in its frame.
 from __future__ import annotations
 
 import numpy as np
-from geometry_msgs.msg import Point
+from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.ros.messages import duration_of, pose_to, time_of
+from cello3d_ros.ros.messages import duration_of, pose_to
 from cello3d_ros.tracking.covariances import N_SIGMA, principal_axes
 
 RADIAN_M = 10.0
@@ -29,11 +28,8 @@ _YELLOW, _VIOLET = (1.0, 1.0, 0.5), (0.8, 0.2, 0.8)
 
 
 def markers_to(
-    stamp_ns: int,
-    frame_id: str,
-    T: Array,
+    pose: PoseWithCovarianceStamped,
     C_step: Array,
-    C_chain: Array,
     *,
     number: int,
     level: int = 0,
@@ -42,22 +38,23 @@ def markers_to(
 ) -> MarkerArray:
     """Return the markers of the ``number``-th answer.
 
-    T: (4, 4), accumulated pose in ``frame_id``.  C_step, C_chain: (6, 6), covariances of the
-    registration and of T, position and rotation along the axes of ``frame_id``.  level: 0, 1 or 2,
-    the colour of the registration (green, orange, red).  scale: how many times as large as they
-    are ellipsoids and arrow are drawn.  lifetime_s: when a marker vanishes; 0 is never.
+    pose: the accumulated one, as it is published.  C_step: (6, 6), covariance of the registration
+    along the axes of the pose's frame.  level: 0, 1 or 2, the colour of the registration (green,
+    orange, red).  scale: how many times as large as they are ellipsoids and arrow are drawn.
+    lifetime_s: when a marker vanishes; 0 is never.
     """
-    blank = Marker(id=number % N_TRAIL, action=Marker.ADD, lifetime=duration_of(lifetime_s))
-    blank.header.stamp, blank.header.frame_id = time_of(stamp_ns), frame_id
-    at, size = T[:3, 3], N_SIGMA * scale
+    blank = Marker(header=pose.header, id=number % N_TRAIL, action=Marker.ADD)
+    blank.lifetime = duration_of(lifetime_s)
+    p, size, color = pose.pose.pose.position, N_SIGMA * scale, _COLORS[level]
+    at, C_chain = np.array([p.x, p.y, p.z]), pose.pose.covariance.reshape(6, 6)
+    translation, chain = (size**2 * C[:3, :3] for C in (C_step, C_chain))
+    rotation = (size * RADIAN_M) ** 2 * C_step[3:, 3:]
     return MarkerArray(
         markers=[
-            _ellipsoid(blank, "translation", at, size**2 * C_step[:3, :3], _COLORS[level], 0.6),
-            _ellipsoid(
-                blank, "rotation", at, (size * RADIAN_M) ** 2 * C_step[3:, 3:], _YELLOW, 0.25
-            ),
-            _arrow(blank, at, size**2 * C_step[:3, :3], _COLORS[level]),
-            _ellipsoid(blank, "chain", at, size**2 * C_chain[:3, :3], _VIOLET, 0.15),
+            _ellipsoid(blank, "translation", at, translation, color, 0.6),
+            _ellipsoid(blank, "rotation", at, rotation, _YELLOW, 0.25),
+            _arrow(blank, at, translation, color),
+            _ellipsoid(blank, "chain", at, chain, _VIOLET, 0.15),
         ]
     )
 
@@ -105,11 +102,3 @@ def _copy(
 
 def _point(p: Array) -> Point:
     return Point(x=float(p[0]), y=float(p[1]), z=float(p[2]))
-
-
-def ellipsoid_of(marker: Marker) -> tuple[Array, Array]:
-    """Return centre (3,) and (3, 3) matrix A of a SPHERE: its surface is ``centre + A e``."""
-    p, q = marker.pose.position, marker.pose.orientation
-    R = se3.pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))[:3, :3]
-    diameters = np.array([marker.scale.x, marker.scale.y, marker.scale.z])
-    return np.array([p.x, p.y, p.z]), R * (0.5 * diameters)

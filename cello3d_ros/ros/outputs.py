@@ -71,14 +71,10 @@ class Outputs:
         verdict: Verdict,
         config: NodeConfig,
     ) -> MarkerArray:
-        T = answer.pose.T
-        C_step = messages.ros_covariance(answer.step.Y, T[:3, :3], *_bounds(config))
+        R = answer.pose.T[:3, :3]
         return markers_to(
-            answer.stamp_ns,
-            pose.header.frame_id,
-            T,
-            C_step,
-            pose.pose.covariance.reshape(6, 6),
+            pose,
+            messages.ros_covariance(answer.step.Y, R, *_bounds(config)),
             number=self._n_answers,
             level=verdict.level,
             scale=config.marker_scale,

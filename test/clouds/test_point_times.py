@@ -189,7 +189,7 @@ def test_deskew_of_a_bag_leaves_out_what_is_not_covered(tmp_path: Path, capsys) 
         scans.append(
             Scan(**{**vars(scan), "T_odom_sensor": se3.exp(0.1 * k * xi)}),
         )
-    write_bag(tmp_path / "a", scans, double=True, odometry_per_scan=1)
+    write_bag(tmp_path / "a", scans, double=True, odometry=1)
     assert main(["convert", str(tmp_path / "a"), str(tmp_path / "b"), "--deskew"]) == 0
     assert "3 scans; 1 left out" in capsys.readouterr().out
     straight = distorted()[1]
@@ -239,7 +239,7 @@ def skewed_bag(path: Path, times) -> Path:
         )
         for k in range(4)
     ]
-    write_bag(path, scans, double=True, odometry_per_scan=1)
+    write_bag(path, scans, double=True, odometry=1)
     return path
 
 

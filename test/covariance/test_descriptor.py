@@ -8,13 +8,19 @@ from cello3d_ros.covariance.descriptor import (
     BINS,
     N_CELL,
     describe_clouds,
-    describe_overlap,
     n_features,
 )
 from cello3d_ros.geometry.se3 import exp, inverse, transform
 
 GRID = GridConfig()
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def described(points, normals, planarity, cylindricality, grid):
+    """Return the descriptor of points that all overlap; the tree is not looked at."""
+    tree = build_tree(np.zeros((1, 3)))
+    cloud = Cloud(points, normals, planarity, cylindricality, tree)
+    return describe_clouds([cloud], [np.ones(len(points), bool)], [np.eye(4)], grid)
 
 
 @pytest.fixture
@@ -29,12 +35,12 @@ def overlap():
 
 def test_the_papers_grid_gives_704_values(overlap):
     assert n_features(GRID) == 704
-    assert describe_overlap(*overlap, GRID).shape == (704,)
+    assert described(*overlap, GRID).shape == (704,)
 
 
 def test_each_cell_says_what_a_loop_over_its_points_says(overlap):
     points, normals, planarity, cylindricality = overlap
-    d = describe_overlap(*overlap, GRID).reshape(4, 4, 4, N_CELL)
+    d = described(*overlap, GRID).reshape(4, 4, 4, N_CELL)
     for place in np.ndindex(4, 4, 4):
         low = np.array([-12.5, -12.5, -5.0]) + np.array(place) * [6.25, 6.25, 2.5]
         inside = ((points >= low) & (points < low + [6.25, 6.25, 2.5])).all(axis=1)
@@ -51,16 +57,16 @@ def test_each_cell_says_what_a_loop_over_its_points_says(overlap):
 
 def test_a_normal_and_its_opposite_are_the_same(overlap):
     points, normals, planarity, cylindricality = overlap
-    flipped = describe_overlap(points, -normals, planarity, cylindricality, GRID)
-    np.testing.assert_array_equal(flipped, describe_overlap(*overlap, GRID))
+    flipped = described(points, -normals, planarity, cylindricality, GRID)
+    np.testing.assert_array_equal(flipped, described(*overlap, GRID))
 
 
 def test_a_quarter_turn_permutes_cells_and_bins(overlap):
     points, normals, planarity, cylindricality = overlap
-    turned = describe_overlap(
+    turned = described(
         points @ QUARTER.T, normals @ QUARTER.T, planarity, cylindricality, GRID
     ).reshape(4, 4, 4, N_CELL)
-    plain = describe_overlap(*overlap, GRID).reshape(4, 4, 4, N_CELL)
+    plain = described(*overlap, GRID).reshape(4, 4, 4, N_CELL)
     moved = np.rot90(plain, axes=(0, 1))  # x -> y
     # x <-> y; (1,1,0) <-> (-1,1,0); the diagonals follow each other round
     bins = [1, 0, 3, 2, 4, 7, 5, 8, 6]
@@ -79,7 +85,7 @@ def test_cells_are_half_open_and_outside_is_ignored():
     one = np.ones(1)
 
     def cells(point):
-        d = describe_overlap(np.array([point]), up, one, one, GRID).reshape(4, 4, 4, N_CELL)
+        d = described(np.array([point]), up, one, one, GRID).reshape(4, 4, 4, N_CELL)
         return np.argwhere(d[..., 0] > 0).tolist()
 
     assert cells([0.0, 0.0, 0.0]) == [[2, 2, 2]]
@@ -92,7 +98,7 @@ def test_cells_are_half_open_and_outside_is_ignored():
 def test_no_points_give_zeros():
     empty = np.empty((0, 3))
     np.testing.assert_array_equal(
-        describe_overlap(empty, empty, np.empty(0), np.empty(0), GRID), np.zeros(704)
+        described(empty, empty, np.empty(0), np.empty(0), GRID), np.zeros(704)
     )
 
 
@@ -112,5 +118,5 @@ def test_clouds_are_described_by_their_overlapping_points_in_one_frame(overlap):
         tree,
     )
     d = describe_clouds((one, other), (seen[first], seen[~first]), (np.eye(4), T), GRID)
-    expected = describe_overlap(*(values[seen] for values in overlap), GRID)
+    expected = described(*(values[seen] for values in overlap), GRID)
     np.testing.assert_allclose(d, expected, atol=1e-12)

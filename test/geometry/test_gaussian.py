@@ -64,7 +64,7 @@ def test_one_sample_has_no_covariance(shape: tuple[int, ...]) -> None:
 def test_changing_sides_and_back_is_the_identity() -> None:
     rng = np.random.default_rng(1)
     T, Y = poses(50, rng), covariances(50, rng)
-    back = g.to_right(T, g.to_left(T, Y))
+    back = g.to_left(se3.inverse(T), g.to_left(T, Y))
     np.testing.assert_allclose(back, Y, rtol=0, atol=1e-12 * np.abs(g.to_left(T, Y)).max())
 
 

@@ -22,7 +22,7 @@ N = 4
 def bag(path: Path, **changes) -> Path:
     """Write scans stamped at the end of their sweep; the first begins before all poses."""
     scans = [replace(swept(k), **changes) for k in range(N)]
-    write_bag(path, scans, double=True, odometry_per_scan=4)
+    write_bag(path, scans, double=True, odometry=4)
     return path
 
 

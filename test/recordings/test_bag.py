@@ -160,7 +160,7 @@ def test_scans_without_poses_are_read_back_without(tmp_path: Path) -> None:
 
 def test_odometry_is_dense_ordered_and_reaches_every_cloud(tmp_path: Path) -> None:
     scans = make_scans(4)
-    write_bag(tmp_path / "one", scans, odometry_per_scan=10)
+    write_bag(tmp_path / "one", scans, odometry=10)
     track = list(BagRecording(tmp_path / "one").odometry())
     assert [stamp for stamp, _ in track] == [START + k * SECOND // 20 for k in range(31)]
     halfway = se3.interpolate(scans[0].T_odom_sensor, scans[1].T_odom_sensor, 0.5)

@@ -10,7 +10,8 @@ from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import CloudConfig, IcpConfig
 from cello3d_ros.geometry.se3 import exp, inverse, log, transform
 from cello3d_ros.registration import icp as module
-from cello3d_ros.registration.icp import icp, register, register_many
+from cello3d_ros.registration.backends import register_many
+from cello3d_ros.registration.icp import icp, register
 
 
 def oracle(reading, reference, normals, T_init, config):

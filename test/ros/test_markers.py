@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from robot import ellipsoid_of
 
 from cello3d_ros.geometry import se3
 from cello3d_ros.ros import markers
+from cello3d_ros.ros.messages import pose_with_covariance
 
 T = se3.exp([1.0, -2.0, 0.5, 0.4, -0.5, 1.6])
 
@@ -16,7 +18,8 @@ def covariance(seed: int, sigma: float = 1e-2) -> np.ndarray:
 
 def shown(C_step, C_chain=None, **settings):
     C_chain = C_step if C_chain is None else C_chain
-    array = markers.markers_to(7, "odom", T, C_step, C_chain, **{"number": 0, **settings})
+    pose = pose_with_covariance(7, "odom", T, C_chain)
+    array = markers.markers_to(pose, C_step, **{"number": 0, **settings})
     return {marker.ns: marker for marker in array.markers}
 
 
@@ -30,7 +33,7 @@ def test_ellipsoids_are_three_sigma_at_the_pose(seed: int, scale: float) -> None
         ("rotation", markers.RADIAN_M**2 * C[3:, 3:]),
         ("chain", C_chain[:3, :3]),
     ):
-        centre, A = markers.ellipsoid_of(found[name])
+        centre, A = ellipsoid_of(found[name])
         np.testing.assert_allclose(centre, T[:3, 3], atol=1e-12)
         np.testing.assert_allclose(A @ A.T, 9.0 * scale**2 * expected, rtol=1e-6, atol=1e-9)
 
@@ -58,9 +61,8 @@ def test_the_arrow_does_not_flip_between_like_answers() -> None:
 def test_no_more_markers_than_the_trail_is_long() -> None:
     keys = set()
     for number in range(3 * markers.N_TRAIL):
-        array = markers.markers_to(
-            number, "odom", T, np.eye(6), np.eye(6), number=number, lifetime_s=2.5
-        )
+        pose = pose_with_covariance(number, "odom", T, np.eye(6))
+        array = markers.markers_to(pose, np.eye(6), number=number, lifetime_s=2.5)
         keys |= {(marker.ns, marker.id) for marker in array.markers}
         assert all(
             m.lifetime.sec == 2 and m.lifetime.nanosec == 500_000_000 for m in array.markers

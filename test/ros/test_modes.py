@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from consumer_rules import of_pose, of_twist
+from robot import ellipsoid_of
 from room_walks import InMemory, walk_in_a_room
 
 from cello3d_ros.config import NodeConfig
@@ -13,7 +14,7 @@ from cello3d_ros.covariance.lost import Lost
 from cello3d_ros.covariance.model import load_model, save_model, shipped_model_path
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import to_fixed_axes
-from cello3d_ros.ros import markers, replay
+from cello3d_ros.ros import replay
 from cello3d_ros.ros.process import NodeProcess
 
 MODES = NodeConfig.__dataclass_fields__["covariance_mode"].metadata["choices"]
@@ -103,11 +104,11 @@ def test_markers_show_what_is_published(by_mode) -> None:
         named = {marker.ns: marker for marker in array.markers}
         assert set(named) == {"translation", "rotation", "weakest", "chain"}
         assert {marker.header.frame_id for marker in array.markers} == {"odom"}
-        centre, A = markers.ellipsoid_of(named["chain"])
+        centre, A = ellipsoid_of(named["chain"])
         np.testing.assert_allclose(centre, pose.T[:3, 3], atol=1e-9)
         np.testing.assert_allclose(A @ A.T, 9.0 * pose.C[:3, :3], rtol=1e-6, atol=1e-10)
         R = pose.T[:3, :3] @ step.T[:3, :3].T  # from the frame of the reference to odom
-        _, A = markers.ellipsoid_of(named["translation"])
+        _, A = ellipsoid_of(named["translation"])
         np.testing.assert_allclose(A @ A.T, 9.0 * R @ step.C[:3, :3] @ R.T, rtol=1e-6, atol=1e-10)
 
 

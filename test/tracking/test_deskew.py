@@ -158,7 +158,7 @@ def test_replay_undoes_the_motion_whatever_is_stamped(tmp_path, stamped, odometr
     scans = [swept(k, stamped) for k in range(N)]
     if not odometry:
         scans = [replace(scan, T_odom_sensor=None) for scan in scans]
-    write_bag(tmp_path / "bag", scans, double=True, odometry_per_scan=4)
+    write_bag(tmp_path / "bag", scans, double=True, odometry=4)
     told = {}
     for deskew in (True, False):
         config = NodeConfig(
