@@ -80,7 +80,8 @@ def make(places: Sequence[Place], source: str) -> Result:
         f"elsewhere. Censi assumes {100 * SIGMA_M:g} cm of noise.\n\n"
         f"{markdown_table(_table(rows))}\n\n"
         f"Ratios to the baseline's mean KL, those of medians in brackets. The paper's are on its "
-        f"own data, which are not these.{_said_of(places)}\n\n{markdown_table(_ratios(rows))}"
+        f"own data, which are not these.{_said_of(places)}\n\n"
+        f"{markdown_table(_ratios(places, rows))}"
     )
     title = "Table I: single-pair covariance prediction"
     return Result("table1", title, text, data, _csv(places, rows), _figure(rows))
@@ -90,8 +91,8 @@ def _said_of(places: Sequence[Place]) -> str:
     if len(places) == 1:
         return ""
     return (
-        f" Means over {len(places)} places of each kind; ± is the 95 % interval of the mean over "
-        f"places."
+        f" Rows are means over {len(places)} places of each kind; ± is the 95 % interval of the "
+        f"mean over places."
     )
 
 
@@ -167,8 +168,8 @@ def _of(found: Figures, name: str = "kl_mean") -> float:
     return np.nan if value is None else float(value)
 
 
-def _ratios(rows: Sequence[dict[str, Row]]) -> list[list[str]]:
-    """Return the ratios to the baseline, beside the paper's."""
+def _ratios(places: Sequence[Place], rows: Sequence[dict[str, Row]]) -> list[list[str]]:
+    """Return the ratios to the baseline, beside the paper's; their means of each place and all."""
     table = [["sequence", "in the paper", *_HEADS.values()]]
     ratios = {
         name: np.array(
@@ -177,11 +178,20 @@ def _ratios(rows: Sequence[dict[str, Row]]) -> list[list[str]]:
         for name in _HEADS
     }  # (places, sequences, 2)
     for k, key in enumerate(rows[0]):
-        means = [ratios[name][:, k].mean(axis=0) for name in _HEADS]
-        cells = [f"{mean:.2f} ({median:.2f})" for mean, median in means]
+        cells = [_interval(r[:, k].mean(axis=0, keepdims=True)) for r in ratios.values()]
         table.append([SEQUENCES[key].title, f"{_paper_ratio(key):.2f}", *cells])
+    means = {name: r.mean(axis=1) for name, r in ratios.items()}  # (places, 2)
+    if len(places) > 1:
+        table += [
+            [
+                f"mean, seed {place.workshop.seed}",
+                "",
+                *(_interval(m[k : k + 1]) for m in means.values()),
+            ]
+            for k, place in enumerate(places)
+        ]
     theirs = f"{np.mean([_paper_ratio(key) for key in rows[0]]):.2f}"
-    return [*table, ["mean", theirs, *(_interval(r.mean(axis=1)) for r in ratios.values())]]
+    return [*table, ["mean", theirs, *(_interval(m) for m in means.values())]]
 
 
 def _interval(means: Array) -> str:

@@ -62,8 +62,10 @@ def make(place: Place) -> Result:
     sentences = [_sentence(key, walk, inside[key]) for key, walk in shown.items()]
     text = (
         f"Runs of ICP odometry from above, {_N_DRAWN} at most, with ellipses of {_N_SIGMA:g}σ of "
-        f"the compounded covariance at each scan. Black is the truth, green the end. Errors and "
-        f"ellipses are drawn larger by the factor at the axis. Share of the drawn ends within "
+        f"the compounded covariance at each scan. Sampled covariances and those of the paper's "
+        f"model are compounded as independent steps, as in the paper, those of the relative model "
+        f"with the bias that neighbouring steps share. Black is the truth, green the end. Errors "
+        f"and ellipses are drawn larger by the factor at the axis. Share of the drawn ends within "
         f"the final ellipse, ideally 86 %. {'. '.join(sentences)}."
     )
     title = "Trajectories: sampled against predicted covariances"
