@@ -135,23 +135,28 @@ def _share_inside(walk: _Walk, last: GaussianPose) -> float:
 
 
 def _figure(shown: dict[str, _Walk]) -> Any:
-    figure = drawing.figure(12.5, 4.6 * len(shown))
+    heights = [max(0.4, _height(walk)) for walk in shown.values()]
+    figure = drawing.figure(12.5, 1.2 + sum(1.2 + 3.6 * height for height in heights))
+    grid = figure.add_gridspec(len(shown), len(_MODELS), height_ratios=heights)
     for row, (key, walk) in enumerate(shown.items()):
         factor = _factor(walk)
         first = None
         for column, (name, path) in enumerate(walk.paths.items()):
-            place = row * len(walk.paths) + column + 1
-            axes = figure.add_subplot(
-                len(shown), len(walk.paths), place, sharex=first, sharey=first
-            )
+            axes = figure.add_subplot(grid[row, column], sharex=first, sharey=first)
             first = first or axes
             _draw(axes, walk, path, factor)
             axes.set_title(f"{SEQUENCES[key].title}: {_MODELS[name]}")
             axes.set_xlabel("x in m")
             if column == 0:
                 axes.set_ylabel(f"y in m (errors × {factor:g})")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="upper center", ncols=4)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
     return figure
+
+
+def _height(walk: _Walk) -> float:
+    """Return how high a path is that is one wide."""
+    width, height = np.ptp(walk.truth[:, :2, 3], axis=0)
+    return float(height / width)
 
 
 def _draw(axes: Any, walk: _Walk, path: list[GaussianPose], factor: float) -> None:
