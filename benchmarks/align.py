@@ -3,9 +3,10 @@
     python benchmarks/align.py [--kinds garden,hall] [--steps 0.1,0.5] [--scanners spinning32]
 
 Each recording is aligned from its clouds alone.  A line: kind, scanner, step; root mean square
-error of a step by pairwise ICP (default pipeline, started near the truth) and by joint poses;
-their ratio; the error that the alignment expects; scans left out.  Lines that are in ``--out``
-already are not computed again.
+error of a step by pairwise ICP of each pipeline, started near the truth, with the ratio of joint
+poses to it in brackets; by joint poses; the error that the alignment expects; scans left out.
+Lines that are in ``--out`` already are not computed again.  ``--in-turn`` takes one scanner for
+each kind and step, in turn, in place of all.
 
     python benchmarks/align.py --labels FOLDER [--kinds garden,hall] [--samples 200]
 
@@ -25,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from cello3d_ros.clouds.shape import prepare
-from cello3d_ros.config import Config, Pipeline, SamplingConfig
+from cello3d_ros.config import PIPELINES, Config, Pipeline, SamplingConfig
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import kl
 from cello3d_ros.geometry.se3 import Array
@@ -40,9 +41,10 @@ from cello3d_ros.registration.icp import register
 from cello3d_ros.simulation.paths import Route, walk
 from cello3d_ros.simulation.products import SCANNERS
 from cello3d_ros.simulation.simulation import Simulation
-from cello3d_ros.simulation.worlds import build_world
+from cello3d_ros.simulation.worlds import WORLDS, build_world
 
-KINDS = "rooms,hall,corridor,stairs,garden,wood"
+KINDS = ",".join(WORLDS)
+SCANNED_BY = "spinning16,spinning32,spinning64,wide"
 PERIOD_NS = 100_000_000
 
 
@@ -90,9 +92,8 @@ def poses_along(route: Route, step_m: float, n: int, rng: np.random.Generator) -
     return np.array([se3.interpolate(T[k], T[k + 1], a) for k, a in zip(i, shares, strict=True)])
 
 
-def pairwise(recording: Bare, truth: Array) -> Array:
-    """Return the errors (n - 1, 6) of default ICP on each pair in a row."""
-    pipeline = Pipeline()
+def pairwise(recording: Bare, truth: Array, pipeline: Pipeline) -> Array:
+    """Return the errors (n - 1, 6) of ICP on each pair in a row."""
     clouds = [
         prepare(scan.points, pipeline.cloud, np.random.default_rng(k))
         for k, scan in enumerate(recording)
@@ -122,7 +123,7 @@ def rms(xi: Array) -> list[float]:
 def measured(kind: str, scanner: str, step_m: float, n_scans: int, seed: int) -> dict[str, object]:
     """Return one line of the table."""
     recording, truth = simulated(kind, scanner, seed, step_m, n_scans)
-    single = pairwise(recording, truth)
+    single = {name: pairwise(recording, truth, pipeline) for name, pipeline in PIPELINES.items()}
     found = align(recording)
     kept = found.members()
     both = np.flatnonzero(np.diff(kept) == 1)
@@ -134,7 +135,7 @@ def measured(kind: str, scanner: str, step_m: float, n_scans: int, seed: int) ->
         "recording": recording.name,
         "kind": kind,
         "step_m": step_m,
-        "pairwise": rms(single[kept[:-1][both]]),
+        **{name: rms(xi[kept[:-1][both]]) for name, xi in single.items()},
         "joint": rms(joint),
         "expected": [1e3 * sigma for sigma in found.sigmas()],
         "d2_over_6": float(d2.mean() / 6.0),
@@ -182,9 +183,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kinds", default=KINDS)
     parser.add_argument("--steps", default="0.02,0.1,0.5,1.5")
-    parser.add_argument("--scanners", default="spinning32")
-    parser.add_argument("--seeds", default="11,12")
-    parser.add_argument("--scans", type=int, default=12)
+    parser.add_argument("--scanners", default=SCANNED_BY)
+    parser.add_argument("--in-turn", action="store_true", help="one scanner for each cell")
+    parser.add_argument("--seeds", default="21")
+    parser.add_argument("--scans", type=int, default=10)
     parser.add_argument("--out", type=Path, help="JSON lines, to write and to go on from")
     parser.add_argument("--labels", type=Path, help="folder for datasets: compare labels instead")
     parser.add_argument("--samples", type=int, default=200)
@@ -199,35 +201,58 @@ def main() -> None:
     if arguments.out and arguments.out.exists():
         rows = map(json.loads, arguments.out.read_text().splitlines())
         done = {row["recording"]: row for row in rows}
-    ratios = defaultdict(list)
-    for kind in arguments.kinds.split(","):
-        for scanner in arguments.scanners.split(","):
-            for step in map(float, arguments.steps.split(",")):
-                for seed in map(int, arguments.seeds.split(",")):
-                    n = max(arguments.scans, int(min(60, 2.4 / step)))
-                    name = f"{kind}-{scanner}-{step:g}-{seed}"
-                    row = done.get(name) or measured(kind, scanner, step, n, seed)
-                    if name not in done and arguments.out:
-                        with arguments.out.open("a") as file:
-                            file.write(json.dumps(row) + "\n")
-                    ratios[kind, scanner, step].append(row)
-                print(line(kind, scanner, step, ratios[kind, scanner, step]), flush=True)
+    rows = defaultdict(list)
+    for kind, scanner, step in cells(arguments):
+        for seed in map(int, arguments.seeds.split(",")):
+            n = max(arguments.scans, int(min(30, 1.4 / step)))
+            name = f"{kind}-{scanner}-{step:g}-{seed}"
+            row = done.get(name) or measured(kind, scanner, step, n, seed)
+            if name not in done and arguments.out:
+                with arguments.out.open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+            rows[kind, scanner, step].append(row)
+        print(line(kind, scanner, step, rows[kind, scanner, step]), flush=True)
+    print(together([row for found in rows.values() for row in found]))
+
+
+def cells(arguments: argparse.Namespace) -> Iterator[tuple[str, str, float]]:
+    """Yield what is measured: kind, scanner, step."""
+    scanners = arguments.scanners.split(",")
+    for i, kind in enumerate(arguments.kinds.split(",")):
+        for j, step in enumerate(map(float, arguments.steps.split(","))):
+            for scanner in [scanners[(i + j) % len(scanners)]] if arguments.in_turn else scanners:
+                yield kind, scanner, step
 
 
 def line(kind: str, scanner: str, step: float, rows: list[dict]) -> str:
     """Return one line for people, over the seeds."""
     mean = {
         key: np.sqrt(np.mean(np.square([row[key] for row in rows]), axis=0))
-        for key in ("pairwise", "joint", "expected")
+        for key in (*PIPELINES, "joint", "expected")
     }
-    ratio = mean["joint"] / mean["pairwise"]
+    joint = mean["joint"]
+    pairs = "  ".join(
+        f"{name} {mean[name][0]:6.2f} mm {mean[name][1]:5.2f} mrad "
+        f"({joint[0] / mean[name][0]:.2f}, {joint[1] / mean[name][1]:.2f})"
+        for name in PIPELINES
+    )
     return (
-        f"{kind:9} {scanner:11} {step:5.2f} m  pairwise {mean['pairwise'][0]:6.2f} mm "
-        f"{mean['pairwise'][1]:5.2f} mrad  joint {mean['joint'][0]:6.2f} {mean['joint'][1]:5.2f}  "
-        f"ratio {ratio[0]:.2f} {ratio[1]:.2f}  expected {mean['expected'][0]:6.2f} "
-        f"{mean['expected'][1]:5.2f}  D2/6 {np.mean([row['d2_over_6'] for row in rows]):.2f}  "
+        f"{kind:13} {scanner:11} {step:5.2f} m  {pairs}  joint {joint[0]:6.2f} {joint[1]:5.2f}  "
+        f"expected {mean['expected'][0]:6.2f} {mean['expected'][1]:5.2f}  "
+        f"D2/6 {np.mean([row['d2_over_6'] for row in rows]):.2f}  "
         f"left out {sum(row['n_left_out'] for row in rows)}"
     )
+
+
+def together(rows: list[dict]) -> str:
+    """Return one line over all recordings: geometric means of the ratios and of D2/6."""
+    logs = [
+        [np.log(row["joint"][0] / row[name][0]) for name in PIPELINES] + [np.log(row["d2_over_6"])]
+        for row in rows
+    ]
+    *ratios, d2_over_6 = np.exp(np.mean(logs, axis=0))
+    said = ", ".join(f"{r:.2f} of pairs by {name}" for r, name in zip(ratios, PIPELINES))
+    return f"{len(rows)} recordings: {said}; D2/6 {d2_over_6:.2f}"
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array, adjoint, exp, inverse, log
 from cello3d_ros.learning.align_chain import Chain, Placed, build_chain
 from cello3d_ros.learning.align_scans import ScanStore, ShapedScan, filtered_scan
+from cello3d_ros.learning.align_smear import Smear, smear_of
 from cello3d_ros.learning.align_sweeps import (
     N_BEFORE,
     cloud_of,
@@ -48,13 +49,13 @@ _TOLERANCE_M = 1e-3  # median change of the steps in a sweep that ends them
 _KEYFRAME_M, _KEYFRAME_RAD = 0.05, 0.02  # motion that makes a new keyframe
 _SAVE_S = 20.0
 _SPREAD = 4  # scans before and after, over which the spread of half-sets is averaged
-_FACTOR = 1.6  # of the half-sets' spread, from errors against exact truth: docs/align.md
+_FACTOR = 1.2  # of the half-sets' spread, from errors against exact truth: docs/align.md
 _FLOOR_M, _FLOOR_RAD = 1e-4, 1e-5
 _OUTLIER = 8.0  # times the usual difference of half-sets: a scan that does not hold,
 _OUTLIER_M, _OUTLIER_RAD = 0.03, 0.015  # from these on
 _STATE = "state.npz"
-_VERSION = 3  # of the state
-_FACTS = ("sweep", "position", "is_last", "is_done", "moves_m", "compensated")
+_VERSION = 4  # of the state
+_FACTS = ("sweep", "position", "is_last", "is_done", "moves_m", "compensated", "smear")
 _ARRAYS = ("stamps_ns", "keyframes", "held", "moved", "halves", "first_poses", "pairs")
 
 Progress = Callable[[int, int], None]  # scans visited so far, and in all as far as known
@@ -70,7 +71,7 @@ class Alignment:
     have poses in one frame; 0 is the longest, -1 is left out.  reasons: why a scan is left out.
     pairwise: (m, 6), of scans in a row: registration of the two alone, from the joint poses.
     moves_m: median change of the steps in each sweep.  compensated: whether the motion within
-    scans was undone.
+    scans was undone.  smear: where points carry no times, what undoing it would do.
     """
 
     name: str
@@ -84,6 +85,7 @@ class Alignment:
     n_contradicted: int = 0
     n_searched: int = 0
     compensated: bool = False
+    smear: Smear | None = None
 
     @property
     def n_parts(self) -> int:
@@ -134,6 +136,7 @@ class _State:
     is_done: bool = False
     moves_m: list[float] = field(default_factory=list)
     compensated: bool = False
+    smear: Smear | None = None
 
 
 def align(
@@ -232,7 +235,7 @@ def _start_pose(scan: Scan, start: PoseTrack | None) -> Array | None:
 
 def _nothing(name: str, n: int, reasons: dict[int, str]) -> str:
     if n < 3:
-        return f"{name} has {n} scans; aligning needs at least 3"
+        return f"{name} has {n} {'scan' if n == 1 else 'scans'}; aligning needs at least 3"
     counts: dict[str, int] = {}
     for reason in reasons.values():
         counts[reason] = counts.get(reason, 0) + 1
@@ -295,6 +298,8 @@ def _sweep(
         state.is_last = rests or state.sweep == MAX_SWEEPS
         _save(folder, key, state)
     _register_pairs(state, store, pipeline, seed)
+    if not state.compensated:
+        state.smear = _smear(state, store, pipeline, seed)
     state.is_done = True
     _save(folder, key, state)
     store.clear()
@@ -363,6 +368,18 @@ def _register_pairs(state: _State, store: ScanStore, pipeline: Pipeline, seed: i
             state.pairs[j] = log(inverse(T) @ found.T_ref_read)
 
 
+def _smear(state: _State, store: ScanStore, pipeline: Pipeline, seed: int) -> Smear | None:
+    """Return what undoing the motion within the scans of the longest part would do."""
+    members = np.flatnonzero((state.chain.part == 0) & state.held)
+    if len(members) < 3:
+        return None
+
+    def shaped(k: int) -> ShapedScan:
+        return store.shaped(k, state.sweep)
+
+    return smear_of(state.chain.poses, members, shaped, seed)
+
+
 def _finished(name: str, state: _State) -> Alignment:
     chain, reasons = state.chain, dict(state.reasons)
     part = chain.part.copy()
@@ -397,6 +414,7 @@ def _finished(name: str, state: _State) -> Alignment:
         n_contradicted=chain.n_contradicted,
         n_searched=chain.n_searched,
         compensated=state.compensated,
+        smear=None if state.smear is None else Smear(*state.smear),
     )
 
 

@@ -77,6 +77,7 @@ def as_dict(alignment: Alignment) -> dict[str, Any]:
         "n_contradicted": alignment.n_contradicted,
         "n_searched": alignment.n_searched,
         "motion_compensated": alignment.compensated,
+        "smear": None if alignment.smear is None else alignment.smear._asdict(),
         "scans": scans,
     }
 
@@ -99,12 +100,21 @@ def sentences(alignment: Alignment) -> Iterator[str]:
             "each has a file of its own"
         )
     if alignment.n_contradicted:
+        n_steps = alignment.n_contradicted
         yield (
             f"the poses to start from are off by more than 0.5 m or 0.2 rad from the clouds in "
-            f"{alignment.n_contradicted} steps; the clouds were followed"
+            f"{n_steps} {'step' if n_steps == 1 else 'steps'}; the clouds were followed"
         )
     if alignment.compensated:
         yield "the motion within each scan was undone"
+    smear = alignment.smear
+    if smear is not None and smear.is_smeared:
+        yield (
+            f"warning: the sensor's motion smears the scans: {100 * smear.share:.0f} % of the "
+            f"{1e3 * smear.moved_m:.0f} mm that surroundings move from scan to scan is within a "
+            f"scan, and without it scans would fit to {1e3 * smear.undone_m:.1f} instead of "
+            f"{1e3 * smear.as_is_m:.1f} mm; record the times of points, or undo the motion before"
+        )
     grouped: dict[str, list[int]] = {}
     for k, reason in alignment.reasons.items():
         grouped.setdefault(reason, []).append(k)

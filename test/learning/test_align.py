@@ -12,17 +12,20 @@ import pytest
 
 from cello3d_ros.clouds.filters import cell_means
 from cello3d_ros.clouds.neighbors import build_tree
-from cello3d_ros.clouds.shape import local_shape
+from cello3d_ros.clouds.shape import local_shape, prepare
 from cello3d_ros.config import CloudConfig, IcpConfig, Pipeline
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log, transform
 from cello3d_ros.learning.align import Alignment, _split, align
 from cello3d_ros.learning.align_chain import share_on_surfaces
+from cello3d_ros.learning.align_report import sentences
 from cello3d_ros.learning.align_scans import ScanStore, ShapedScan
+from cello3d_ros.learning.align_smear import smear_of
 from cello3d_ros.learning.align_sweeps import cloud_of, common_normals, neighbors_of
 from cello3d_ros.recordings.poses import tum_line
 from cello3d_ros.recordings.recording import Scan
+from cello3d_ros.simulation.drives import Drive
 from cello3d_ros.simulation.products import SCANNERS
 from cello3d_ros.simulation.simulation import Simulation
 
@@ -238,6 +241,34 @@ def test_the_motion_within_scans_is_undone() -> None:
 
     assert worst(found) < 0.005
     assert worst(found) < 0.5 * worst(smeared)
+    assert found.smear is None
+
+
+@pytest.mark.parametrize("sweeps", [True, False])
+def test_scans_without_times_are_said_to_be_smeared_where_they_are(
+    sweeps: bool, room: tuple[list[Scan], Array, Alignment]
+) -> None:
+    drive = Drive(speed_m_s=5.0, turn_rad_s=0.5, sweeps=sweeps)
+    scans = list(Simulation("street", 1, 7, SCANNERS["vlp16"], drive=drive))
+    poses = np.array([scan.T_world_sensor for scan in scans])
+
+    def shaped(k: int) -> ShapedScan:
+        return ShapedScan(*prepare(scans[k].points, CloudConfig(), np.random.default_rng(k))[:2])
+
+    smear = smear_of(poses, np.arange(len(scans)), shaped, 0)
+    assert smear is not None
+    assert smear.is_smeared == sweeps
+    assert abs(smear.share - sweeps) < 0.1
+    assert smear.moved_m > 0.15
+    assert smear.undone_m < 0.8 * smear.as_is_m or not sweeps
+    said = list(sentences(replace(room[2], smear=smear)))
+    assert any(s.startswith("warning: the sensor's motion smears") for s in said) == sweeps
+
+
+def test_scans_that_stand_still_are_not_asked_for_smear() -> None:
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    scan = ShapedScan(surfaces(1), np.ones((1, 3)))
+    assert smear_of(poses, np.arange(5), lambda k: scan, 0) is None
 
 
 def test_a_part_is_cut_where_a_pair_disagrees_and_short_pieces_are_dropped() -> None:
