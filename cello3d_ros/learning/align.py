@@ -28,6 +28,7 @@ from cello3d_ros.config import Pipeline
 from cello3d_ros.errors import CloudError, RecordingError
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array, adjoint, exp, inverse, log
+from cello3d_ros.learning.align_carried import Carried, carried_of
 from cello3d_ros.learning.align_chain import Chain, Placed, build_chain
 from cello3d_ros.learning.align_scans import ScanStore, ShapedScan, filtered_scan
 from cello3d_ros.learning.align_smear import Smear, smear_of
@@ -55,7 +56,9 @@ _OUTLIER = 8.0  # times the usual difference of half-sets: a scan that does not 
 _OUTLIER_M, _OUTLIER_RAD = 0.03, 0.015  # from these on
 _STATE = "state.npz"
 _VERSION = 4  # of the state
-_FACTS = ("sweep", "position", "is_last", "is_done", "moves_m", "compensated", "smear")
+_FACTS = (
+    *("sweep", "position", "is_last", "is_done", "moves_m", "compensated", "smear", "carried"),
+)
 _ARRAYS = ("stamps_ns", "keyframes", "held", "moved", "halves", "first_poses", "pairs")
 
 Progress = Callable[[int, int], None]  # scans visited so far, and in all as far as known
@@ -71,7 +74,8 @@ class Alignment:
     have poses in one frame; 0 is the longest, -1 is left out.  reasons: why a scan is left out.
     pairwise: (m, 6), of scans in a row: registration of the two alone, from the joint poses.
     moves_m: median change of the steps in each sweep.  compensated: whether the motion within
-    scans was undone.  smear: where points carry no times, what undoing it would do.
+    scans was undone.  smear: where points carry no times, what undoing it would do.  carried: what
+    moves with the sensor.
     """
 
     name: str
@@ -86,6 +90,7 @@ class Alignment:
     n_searched: int = 0
     compensated: bool = False
     smear: Smear | None = None
+    carried: Carried | None = None
 
     @property
     def n_parts(self) -> int:
@@ -137,6 +142,7 @@ class _State:
     moves_m: list[float] = field(default_factory=list)
     compensated: bool = False
     smear: Smear | None = None
+    carried: Carried | None = None
 
 
 def align(
@@ -298,8 +304,7 @@ def _sweep(
         state.is_last = rests or state.sweep == MAX_SWEEPS
         _save(folder, key, state)
     _register_pairs(state, store, pipeline, seed)
-    if not state.compensated:
-        state.smear = _smear(state, store, pipeline, seed)
+    _look_at_scans(state, store, seed)
     state.is_done = True
     _save(folder, key, state)
     store.clear()
@@ -368,16 +373,18 @@ def _register_pairs(state: _State, store: ScanStore, pipeline: Pipeline, seed: i
             state.pairs[j] = log(inverse(T) @ found.T_ref_read)
 
 
-def _smear(state: _State, store: ScanStore, pipeline: Pipeline, seed: int) -> Smear | None:
-    """Return what undoing the motion within the scans of the longest part would do."""
+def _look_at_scans(state: _State, store: ScanStore, seed: int) -> None:
+    """Find what may be wrong with the scans of the longest part: smeared, or with the vehicle."""
+    poses = state.chain.poses
     members = np.flatnonzero((state.chain.part == 0) & state.held)
-    if len(members) < 3:
-        return None
 
     def shaped(k: int) -> ShapedScan:
         return store.shaped(k, state.sweep)
 
-    return smear_of(state.chain.poses, members, shaped, seed)
+    if len(members) >= 3:
+        state.carried = carried_of(poses, members, shaped)
+        if not state.compensated:
+            state.smear = smear_of(poses, members, shaped, seed)
 
 
 def _finished(name: str, state: _State) -> Alignment:
@@ -415,6 +422,7 @@ def _finished(name: str, state: _State) -> Alignment:
         n_searched=chain.n_searched,
         compensated=state.compensated,
         smear=None if state.smear is None else Smear(*state.smear),
+        carried=None if state.carried is None else Carried(*state.carried),
     )
 
 

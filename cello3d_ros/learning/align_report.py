@@ -77,6 +77,7 @@ def as_dict(alignment: Alignment) -> dict[str, Any]:
         "n_contradicted": alignment.n_contradicted,
         "n_searched": alignment.n_searched,
         "motion_compensated": alignment.compensated,
+        "carried": None if alignment.carried is None else alignment.carried._asdict(),
         "smear": None if alignment.smear is None else alignment.smear._asdict(),
         "scans": scans,
     }
@@ -114,6 +115,13 @@ def sentences(alignment: Alignment) -> Iterator[str]:
             f"{1e3 * smear.moved_m:.0f} mm that surroundings move from scan to scan is within a "
             f"scan, and without it scans would fit to {1e3 * smear.undone_m:.1f} instead of "
             f"{1e3 * smear.as_is_m:.1f} mm; record the times of points, or undo the motion before"
+        )
+    carried = alignment.carried
+    if carried is not None and carried.is_many:
+        yield (
+            f"warning: {100 * carried.share:.0f} % of the points move with the sensor, most of "
+            f"them within {carried.reach_m:.1f} m: what carries it pulls registrations towards no "
+            "motion; leave it out by cloud.min_range_m"
         )
     grouped: dict[str, list[int]] = {}
     for k, reason in alignment.reasons.items():

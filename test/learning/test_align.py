@@ -18,6 +18,7 @@ from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array, exp, inverse, log, transform
 from cello3d_ros.learning.align import Alignment, _split, align
+from cello3d_ros.learning.align_carried import carried_of
 from cello3d_ros.learning.align_chain import share_on_surfaces
 from cello3d_ros.learning.align_report import sentences
 from cello3d_ros.learning.align_scans import ScanStore, ShapedScan
@@ -265,10 +266,31 @@ def test_scans_without_times_are_said_to_be_smeared_where_they_are(
     assert any(s.startswith("warning: the sensor's motion smears") for s in said) == sweeps
 
 
-def test_scans_that_stand_still_are_not_asked_for_smear() -> None:
+@pytest.mark.parametrize("carried", [True, False])
+def test_a_vehicle_that_moves_with_the_sensor_is_found(
+    carried: bool, room: tuple[list[Scan], Array, Alignment]
+) -> None:
+    rng = np.random.default_rng(6)
+    bow = box_points(rng, 600, np.array([1.0, 0.8, 0.3])) + [1.2, 0.0, -0.6]
+    clouds = [np.concatenate([s.points, bow]) if carried else s.points for s in room[0]]
+
+    def shaped(k: int) -> ShapedScan:
+        noisy = clouds[k] + np.random.default_rng(k).normal(scale=0.005, size=clouds[k].shape)
+        return ShapedScan(*prepare(noisy, CloudConfig(), np.random.default_rng(k))[:2])
+
+    found = carried_of(room[1], np.arange(N_SCANS), shaped)
+    assert found is not None
+    assert found.is_many == carried
+    said = list(sentences(replace(room[2], carried=found)))
+    assert any("% of the points move with the sensor" in s for s in said) == carried
+    assert 1.0 < found.reach_m < 2.5 or not carried
+
+
+def test_scans_that_stand_still_are_asked_neither() -> None:
     poses = np.tile(np.eye(4), (5, 1, 1))
     scan = ShapedScan(surfaces(1), np.ones((1, 3)))
     assert smear_of(poses, np.arange(5), lambda k: scan, 0) is None
+    assert carried_of(poses, np.arange(5), lambda k: scan) is None
 
 
 def test_a_part_is_cut_where_a_pair_disagrees_and_short_pieces_are_dropped() -> None:
