@@ -129,7 +129,7 @@ def profile(read: Any, ref: Any, normals: Any, T: Any, n_runs: int = 50) -> dict
     parts = {
         "search": lambda: search(tree.leaves, queries, 1.2 * limit, d2, indices),
         "trim": lambda: select(d2.flatten(), keys, 0, d2.size, rank),
-        "accumulate": lambda: kernels._plane_step(
+        "accumulate": lambda: kernels.plane_step(
             moved, queries, tree.points, normals, d2, indices, limit
         ),
     }

@@ -26,7 +26,15 @@ from cello3d_ros.clouds.neighbors import Indices, KdTree, build_tree, nearest
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import Array
-from cello3d_ros.registration.kernels import advance, begin, finish, move, trim_limit
+from cello3d_ros.registration.kernels import (
+    begin,
+    compound,
+    finish,
+    move,
+    plane_step,
+    point_step,
+    trim_limit,
+)
 
 _SLACK = 1.2  # search beyond the last trim limit, in squared distance
 
@@ -116,15 +124,17 @@ def _register(
     reason, rms, n_kept, limit2 = "max_iterations", math.nan, 0, math.inf
     while len(steps) < config.max_iterations and reason == "max_iterations":
         move(motion, start, mean, moved, queries)
-        distances2, indices, limit2 = _associate(tree, queries, limit2, config, n_threads)
-        associations = distances2, indices, limit2, config.error_metric == "point_to_plane"
-        ok, rotation, translation, rms, n_kept = advance(
-            moved, queries, tree.points, normals, mean, *associations, motion
-        )
+        associations = _associate(tree, queries, limit2, config, n_threads)
+        limit2 = associations[2]
+        if config.error_metric == "point_to_plane":
+            found = plane_step(moved, queries, tree.points, normals, *associations)
+        else:
+            found = point_step(moved, mean, tree.points, *associations)
+        ok, step, rms, n_kept = found
         if not ok:
             reason = "singular"
             continue
-        steps.append((rotation, translation))
+        steps.append(compound(step, motion))
         if len(steps) >= config.n_smoothed and _is_still(steps[-config.n_smoothed :], config):
             reason = ""
     finish(motion, T, mean)

@@ -40,36 +40,14 @@ def trim_limit(distances2: Array, rank: int) -> float:
 
 
 @kernel()
-def advance(
-    moved: Array,
-    queries: Array,
-    points: Array,
-    normals: Array,
-    mean: Array,
-    distances2: Array,
-    indices: Indices,
-    limit2: float,
-    to_plane: bool,
-    motion: Array,
-) -> tuple[bool, float, float, float, int]:
-    """Solve for one step and move ``motion`` in place by it.
-
-    Returns whether it could be solved, the step's rotation and translation, RMS and kept count.
-    """
-    if to_plane:
-        ok, step, rms, n_kept = _plane_step(
-            moved, queries, points, normals, distances2, indices, limit2
-        )
-    else:
-        ok, step, rms, n_kept = _point_step(moved, mean, points, distances2, indices, limit2)
-    if not ok:
-        return False, 0.0, 0.0, rms, n_kept
+def compound(step: Array, motion: Array) -> tuple[float, float]:
+    """Move ``motion`` in place by a step; return the step's rotation and translation."""
     last = motion.copy()
-    motion[:] = _product(step, last)
+    _multiply(step, last, motion)
     translation = 0.0
     for a in range(3):
         translation += (motion[a, 3] - last[a, 3]) ** 2
-    return True, _angle(step), math.sqrt(translation), rms, n_kept
+    return _angle(step), math.sqrt(translation)
 
 
 @kernel()
@@ -77,7 +55,7 @@ def finish(motion: Array, T: Array, mean: Array) -> None:
     """Move T in place by a motion about the mean."""
     for a in range(3):
         T[a, 3] -= mean[a]
-    T[:] = _product(motion, T)
+    _multiply(motion, T.copy(), T)
     for a in range(3):
         T[a, 3] += mean[a]
 
@@ -92,18 +70,17 @@ def _move(T: Array, points: Array, moved: Array) -> None:
 
 
 @kernel()
-def _product(A: Array, B: Array) -> Array:
-    """Return ``A @ B`` of two (4, 4), compiled faster than numba's."""
-    C = np.zeros((4, 4))
+def _multiply(A: Array, B: Array, C: Array) -> None:
+    """Fill C with ``A @ B``, all (4, 4); compiled faster than numba's."""
     for i in range(4):
         for j in range(4):
+            C[i, j] = 0.0
             for a in range(4):
                 C[i, j] += A[i, a] * B[a, j]
-    return C
 
 
 @kernel()
-def _plane_step(
+def plane_step(
     moved: Array,
     queries: Array,
     points: Array,
@@ -156,7 +133,7 @@ def _plane_step(
 
 
 @kernel()
-def _point_step(
+def point_step(
     moved: Array, mean: Array, points: Array, distances2: Array, indices: Indices, limit2: float
 ) -> tuple[bool, Array, float, int]:
     """Find the rigid motion that best moves the kept points onto theirs (Umeyama 1991)."""
