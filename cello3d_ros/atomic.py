@@ -5,11 +5,32 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from cello3d_ros.errors import WriteError
+
+
+def check_outputs(paths: Sequence[Path], inputs: Iterable[Path | str | None] = ()) -> None:
+    """Raise WriteError, before the work, where files cannot be written or would replace an input.
+
+    A file within a folder that is read counts as a part of it.
+    """
+    read = {Path(path).resolve(): path for path in inputs if path is not None}
+    for path in paths:
+        folder = path.absolute().parent
+        if path.is_dir() or not folder.is_dir():
+            raise WriteError(f"cannot write {path}: not a file in an existing folder")
+        if path.exists() and not path.is_file():
+            raise WriteError(f"cannot write {path}: it is not a file")
+        if not os.access(folder, os.W_OK):
+            raise WriteError(f"cannot write {path}: its folder cannot be written to")
+        here = path.resolve()
+        if path.exists() and (found := read.keys() & {here, *here.parents}):
+            raise WriteError(f"cannot write {path}: it is a part of {read[min(found)]}, an input")
+    if len({path.resolve() for path in paths}) < len(paths):
+        raise WriteError(f"the same file is to be written twice: {', '.join(map(str, paths))}")
 
 
 @contextmanager

@@ -541,7 +541,8 @@ def load_config(path: Path | str, pipeline: str = "") -> Config:
         with open(path, encoding="utf-8") as stream:
             tree = yaml.safe_load(stream) or {}
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"cannot read the configuration {path}: {error}") from None
+        why = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"cannot read the configuration {path}: {why}") from None
     if not isinstance(tree, dict):
         raise ConfigError(f"{path}: expected sections such as 'icp:', found {tree!r}")
     for value in tree.values():

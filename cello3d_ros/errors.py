@@ -76,6 +76,11 @@ class WriteError(Cello3dError):
     """A file or folder cannot be written."""
 
 
+def counted(n: int, thing: str) -> str:
+    """Return a number of things in words: ``1 scan``, ``2 scans``."""
+    return f"{n} {thing}" if n == 1 else f"{n} {thing}s"
+
+
 def how_to_install(extra: str, error: Exception) -> str:
     """Return what to do about an optional library that raised an error when imported.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -12,8 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cello3d_ros.atomic import check_outputs
+from cello3d_ros.cli.arguments import add_jobs_argument, add_seed_argument
 from cello3d_ros.cli.sources import add_source_arguments, in_words, open_source
-from cello3d_ros.errors import RecordingError
 
 if TYPE_CHECKING:
     from cello3d_ros.config import Pipeline
@@ -33,10 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_source_arguments(parser)
     parser.add_argument("--report", metavar="FILE", type=Path, help="JSON of every scan, to write")
-    parser.add_argument("--seed", type=int, default=0, help="of the random subsamples")
-    parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="threads"
-    )
+    add_seed_argument(parser)
+    add_jobs_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -47,9 +45,8 @@ def run(arguments: argparse.Namespace) -> None:
     from cello3d_ros.learning.align_report import as_dict, sentences, write_poses
     from cello3d_ros.recordings.start_poses import start_track
 
-    for path in (arguments.out, arguments.report):
-        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
-            raise RecordingError(f"cannot write {path}: not a file in an existing folder")
+    outputs = [path for path in (arguments.out, arguments.report) if path is not None]
+    check_outputs(outputs, [arguments.recording, arguments.poses])
     poses, arguments.poses = arguments.poses, None
     recording = open_source(arguments.recording, arguments)
     start = None if poses is None else start_track(poses, recording)

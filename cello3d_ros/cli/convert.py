@@ -16,7 +16,7 @@ from cello3d_ros.cli.sources import (
     open_source,
     with_progress,
 )
-from cello3d_ros.errors import RecordingError
+from cello3d_ros.errors import RecordingError, counted
 
 if TYPE_CHECKING:
     from cello3d_ros.recordings import Recording, Scan
@@ -102,7 +102,7 @@ def _write(arguments: argparse.Namespace, recording: Recording, scans: Iterable[
 
 
 def _sentence(summary: dict[str, Any], deskew: bool) -> str:
-    text = f"{summary['out']}: {summary['n_scans']} scans"
+    text = f"{summary['out']}: {counted(summary['n_scans'], 'scan')}"
     if summary["n_left_out"]:
         text += f"; {summary['n_left_out']} left out, their poses do not cover them"
     for what in ("ground_truth", "odometry"):

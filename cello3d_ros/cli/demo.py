@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cello3d_ros.ros.process import NodeProcess
     from cello3d_ros.ros.replay import Replay
 
+_LAST_DOMAIN = 232  # of DDS
 _CHI2_6_95 = 12.591587  # 95 % of a chi-squared distribution of 6 degrees of freedom
 _SLICE_M, _SLICE_POINTS = 1.0, 3000  # of each scan: what the picture shows of the surroundings
 _ROS_IS_MISSING = (
@@ -59,7 +60,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="parameter of the node; may be repeated",
     )
     add_source_arguments(parser)
-    parser.add_argument("--domain-id", type=int, help="ROS domain of the demo (one of its own)")
+    parser.add_argument(
+        "--domain-id", type=_domain, metavar="N", help="ROS domain of the demo (one of its own)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -93,6 +96,12 @@ def run(arguments: argparse.Namespace) -> int:
     if complaint is not None:
         raise Cello3dError(complaint)
     return 0
+
+
+def _domain(word: str) -> int:
+    if not 0 <= (number := int(word)) <= _LAST_DOMAIN:
+        raise argparse.ArgumentTypeError(f"must be 0 to {_LAST_DOMAIN}: {word}")
+    return number
 
 
 def demo_bag() -> Path:

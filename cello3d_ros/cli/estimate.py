@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cello3d_ros.cli.sources import add_pipeline_argument
+from cello3d_ros.cli.arguments import add_pipeline_argument, add_seed_argument
 from cello3d_ros.config import COVARIANCE_MODES, PIPELINES
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.geometry.se3 import Array, is_rigid
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="how the covariance is found; fused is experimental",
     )
     add_pipeline_argument(parser, "the model's")
-    parser.add_argument("--seed", type=int, default=0, help="of the random subsamples")
+    add_seed_argument(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -75,7 +75,8 @@ def _read_pose(path: Path) -> Array:
     try:
         values = np.array(path.read_text().replace(",", " ").split(), dtype=np.float64)
     except (OSError, ValueError) as error:
-        raise RecordingError(f"cannot read the pose {path}: {error}") from None
+        why = error.strerror if isinstance(error, OSError) else "it holds more than numbers"
+        raise RecordingError(f"cannot read the pose {path}: {why}") from None
     if values.size not in (12, 16):
         raise RecordingError(f"{path} holds {values.size} numbers, a pose has 16 or 12")
     T = np.eye(4)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cello3d_ros.errors import Cello3dError
+from cello3d_ros.atomic import check_outputs
+from cello3d_ros.cli.arguments import add_jobs_argument, add_seed_argument, positive
 
 if TYPE_CHECKING:
     from cello3d_ros.evaluation.result import Distances, Evaluation
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--model", metavar="M", default="general", help="model file, or a shipped model's name"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="all figures, to write")
-    parser.add_argument("--seed", type=int, default=0, help="of every random draw")
+    add_seed_argument(parser, "of every random draw")
     _words(parser, "--only", "PATTERN", "recordings to evaluate, such as '*_s11'; all by default")
     parser.add_argument(
         "--allow-seen",
@@ -79,9 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "PATTERN",
         "recordings with exact ground truth (simulation): the pose check flags none of them",
     )
-    parser.add_argument(
-        "--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N", help="threads"
-    )
+    add_jobs_argument(parser)
     _add_online_arguments(parser)
 
 
@@ -90,16 +88,16 @@ def _add_online_arguments(parser: argparse.ArgumentParser) -> None:
         parser, "--recordings", "RECORDING", "bags or data sets, for the methods that need clouds"
     )
     parser.add_argument(
-        "--online-pairs", type=_positive, metavar="N", help="pairs of a recording they are run on"
+        "--online-pairs", type=positive, metavar="N", help="pairs of a recording they are run on"
     )
     parser.add_argument(
-        "--registrations", type=_positive, default=12, metavar="N", help="of Monte Carlo, fused"
+        "--registrations", type=positive, default=12, metavar="N", help="of Monte Carlo, fused"
     )
     parser.add_argument(
         "--sensor-sigma", type=float, default=0.01, metavar="M", help="noise of a point (0.01 m)"
     )
     parser.add_argument(
-        "--trajectories", type=_positive, metavar="N", help="runs of ICP odometry of a recording"
+        "--trajectories", type=positive, metavar="N", help="runs of ICP odometry of a recording"
     )
 
 
@@ -109,8 +107,8 @@ def run(arguments: argparse.Namespace) -> None:
     from cello3d_ros.evaluation.result import write_evaluation
 
     out: Path | None = arguments.json
-    if out is not None and (out.is_dir() or not out.parent.is_dir()):  # before the work
-        raise Cello3dError(f"cannot write {out}: not a file in an existing folder")
+    if out is not None:
+        check_outputs([out], [*arguments.datasets, *arguments.baseline, *arguments.recordings])
     settings = EvaluationSettings(
         only=arguments.only,
         exact_poses=arguments.exact_poses,
@@ -138,12 +136,6 @@ def _progress(name: str, done: int, total: int) -> None:
 
 def _words(parser: argparse.ArgumentParser, flag: str, metavar: str, text: str) -> None:
     parser.add_argument(flag, nargs="+", action="extend", default=[], metavar=metavar, help=text)
-
-
-def _positive(word: str) -> int:
-    if (number := int(word)) < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1: {word}")
-    return number
 
 
 def _tables(found: Evaluation) -> Iterator[str]:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cello3d_ros.cli.sources import (
+from cello3d_ros.atomic import check_outputs
+from cello3d_ros.cli.arguments import (
+    add_jobs_argument,
     add_pipeline_argument,
-    add_source_arguments,
-    open_source,
-    with_progress,
+    add_seed_argument,
+    positive,
 )
-from cello3d_ros.errors import RecordingError
+from cello3d_ros.cli.sources import add_source_arguments, open_source, with_progress
+from cello3d_ros.errors import RecordingError, counted
 
 if TYPE_CHECKING:
     from cello3d_ros.evaluation.graph import Graph, GraphSettings
@@ -37,7 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_pipeline_argument(parser, "the model's")
     add_source_arguments(parser)
     parser.add_argument(
-        "--max-gap", type=int, default=1, metavar="G", help="scans before a scan to register to"
+        "--max-gap",
+        type=positive,
+        default=1,
+        metavar="G",
+        help="scans before a scan to register to",
     )
     parser.add_argument(
         "--loops",
@@ -67,10 +72,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="icp",
         help="icp, started at the poses; or external: the poses are registrations already",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the random subsamples")
-    parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="threads"
-    )
+    add_seed_argument(parser)
+    add_jobs_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -84,6 +87,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     for out in arguments.out:
         check_graph_file(out)
+    check_outputs(arguments.out, [arguments.recording, arguments.poses, arguments.loops])
     settings = _settings(arguments)
     poses, arguments.poses = arguments.poses, None
     source = open_source(arguments.recording, arguments)
@@ -108,16 +112,14 @@ def _settings(arguments: argparse.Namespace) -> GraphSettings:
     from cello3d_ros.evaluation.graph_files import read_loops
     from cello3d_ros.recordings.odometry import Drift
 
-    if arguments.max_gap < 1:
-        raise RecordingError(f"--max-gap must be at least 1: {arguments.max_gap}")
-    if not 0.0 < arguments.scale < np.inf:
-        raise RecordingError(f"--scale must be above 0: {arguments.scale}")
+    if not 1e-6 <= arguments.scale <= 1e6:
+        raise RecordingError(f"--scale must be in [1e-6, 1e6]: {arguments.scale}")
     drift = None
     if arguments.odometry_drift is not None:
         share, deg_per_m, turn_share = arguments.odometry_drift
         drift = Drift(share, float(np.radians(deg_per_m)), turn_share)
-        if not all(np.isfinite(value) and value >= 0.0 for value in drift):
-            raise RecordingError("--odometry-drift needs three numbers that are not negative")
+        if not all(0.0 <= value <= 100.0 for value in drift):
+            raise RecordingError("--odometry-drift needs three numbers from 0 to 100")
         if str(arguments.poses) == "joint":
             raise RecordingError(
                 "--odometry-drift needs odometry, and --poses joint leaves it out"
@@ -135,7 +137,7 @@ def _settings(arguments: argparse.Namespace) -> GraphSettings:
 def _sentence(graph: Graph) -> str:
     kinds = [edge.kind for edge in graph.edges]
     trusts = [edge.trust for edge in graph.edges if edge.trust is not None]
-    text = f"{len(graph.poses)} poses, {len(trusts)} registration{'s' * (len(trusts) != 1)}"
+    text = f"{counted(len(graph.poses), 'pose')}, {counted(len(trusts), 'registration')}"
     if n := kinds.count("loop"):
         text += f" ({n} of loops)"
     text += f", of which {sum(t.is_unknown for t in trusts)} are unlike the training data and "

@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print(json.dumps(description, indent=2))
     else:
-        print("\n".join(table(description)))
+        print("\n".join(table(without_prints(description))))
 
 
 def describe(path: Path, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -53,6 +53,15 @@ def describe(path: Path, arguments: argparse.Namespace) -> dict[str, Any]:
             return {"kind": kind.name, "path": str(path), **kind.describe(path, arguments)}
     names = " or ".join(kind.name for kind in KINDS)
     raise Cello3dError(f"{path} is not a {names}")
+
+
+def without_prints(description: dict[str, Any]) -> dict[str, Any]:
+    """Return the description with a count in place of the fingerprints that a model keeps."""
+    provenance = description.get("provenance", {})
+    if not (prints := provenance.get("prints")):
+        return description
+    count = f"of {len(prints)} recordings (--json shows them)"
+    return {**description, "provenance": {**provenance, "prints": count}}
 
 
 def table(description: dict[str, Any]) -> Iterator[str]:

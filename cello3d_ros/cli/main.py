@@ -53,10 +53,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         _forget_output()
         return 0
     except OSError as error:
-        if error.errno not in _FULL:
+        if error.errno in _FULL:
+            _forget_output()
+            print(f"cello3d: cannot write the output: {error.strerror}", file=sys.stderr)
+        elif error.filename is not None:
+            print(f"cello3d: {error.filename}: {error.strerror}", file=sys.stderr)
+        else:
             raise
-        _forget_output()
-        print(f"cello3d: cannot write the output: {error.strerror}", file=sys.stderr)
         return 1
 
 

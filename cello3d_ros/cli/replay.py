@@ -12,9 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cello3d_ros.cli.arguments import add_pipeline_argument
 from cello3d_ros.cli.sources import (
-    add_pipeline_argument,
     add_source_arguments,
+    check_folder,
     in_words,
     open_source,
     with_progress,
@@ -58,6 +59,7 @@ def run(arguments: argparse.Namespace) -> None:
     from cello3d_ros.tracking.offline import replay
     from cello3d_ros.tracking.tracker import Tracker
 
+    check_folder(arguments.out)
     node = load_config(arguments.config).node if arguments.config else Config().node
     if arguments.extrinsic is None and node.T_base_sensor != NodeConfig().T_base_sensor:
         arguments.extrinsic = node.T_base_sensor

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cello3d_ros.atomic import new_file
-from cello3d_ros.errors import Cello3dError, RecordingError
+from cello3d_ros.atomic import check_outputs, new_file
+from cello3d_ros.errors import RecordingError
 
 if TYPE_CHECKING:
     from cello3d_ros.evaluation.result import ShownPair
@@ -43,8 +43,7 @@ def run(arguments: argparse.Namespace) -> None:
     from cello3d_ros.reporting.page import page
 
     out: Path = arguments.out
-    if out.is_dir() or not out.parent.is_dir():
-        raise Cello3dError(f"cannot write {out}: not a file in an existing folder")
+    check_outputs([out], [arguments.evaluation, *arguments.recordings])
     found = read_evaluation(arguments.evaluation)
     clouds = _clouds(found.worst_pairs, arguments.recordings)
     text = page(found, clouds)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cello3d_ros.cli.arguments import add_jobs_argument, add_seed_argument, positive
 from cello3d_ros.errors import Cello3dError
 
 if TYPE_CHECKING:
@@ -42,28 +42,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--samples",
-        type=_positive,
+        type=positive,
         metavar="N",
         help="registrations of each pair, 5000 in the paper; by default 250 for tables, and what "
         "a figure needs",
     )
     parser.add_argument(
-        "--scans", type=_positive, metavar="N", help="of each simulation, by default all"
+        "--scans", type=positive, metavar="N", help="of each simulation, by default all"
     )
     parser.add_argument(
         "--places",
-        type=_positive,
+        type=positive,
         default=1,
         metavar="N",
         help="simulated places of each kind, of successive seeds (1)",
     )
     parser.add_argument(
-        "--runs", type=_positive, default=100, metavar="N", help="odometries of a recording (100)"
+        "--runs", type=positive, default=100, metavar="N", help="odometries of a recording (100)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of places and random draws (0)")
-    parser.add_argument(
-        "--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N", help="threads"
-    )
+    add_seed_argument(parser, "of places and random draws (0)")
+    add_jobs_argument(parser)
     _add_places(parser)
 
 
@@ -84,8 +82,6 @@ def _add_places(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Make what was asked for, each published as soon as it is done."""
-    if arguments.seed < 0:
-        raise Cello3dError(f"--seed must not be negative: {arguments.seed}")
     if arguments.scans == 1:
         raise Cello3dError("--scans must be at least 2: odometry needs two scans")
     if arguments.data and arguments.places > 1:
@@ -181,9 +177,3 @@ def _command(what: str, arguments: argparse.Namespace) -> str:
 
 def _choices() -> str:
     return ", ".join([*_N_SAMPLES, "all"])
-
-
-def _positive(word: str) -> int:
-    if (number := int(word)) < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1: {word}")
-    return number

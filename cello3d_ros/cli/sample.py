@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -12,7 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cello3d_ros.cli.sources import add_pipeline_argument
+from cello3d_ros.cli.arguments import (
+    add_jobs_argument,
+    add_pipeline_argument,
+    add_seed_argument,
+    positive,
+)
 from cello3d_ros.config import Config, SamplingConfig, config_from, load_config, pipeline_of
 from cello3d_ros.errors import ConfigError
 
@@ -52,11 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="standard deviation of ranges at each registration, m: of noise added to recorded "
         "clouds, or of new scans where the recording was made by cello3d simulate",
     )
-    parser.add_argument("--seed", type=int, help="seed of every random draw")
-    parser.add_argument("--max-gap", type=int, metavar="G", help="largest j - i of a pair")
-    parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="threads"
-    )
+    add_seed_argument(parser, "of every random draw", default=None)
+    parser.add_argument("--max-gap", type=positive, metavar="G", help="largest j - i of a pair")
+    add_jobs_argument(parser)
     parser.add_argument(
         "--poses",
         choices=("recorded", "joint"),
@@ -69,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--ship-clouds", action="store_true", help="send the scans: workers cannot read them"
     )
     cluster.add_argument(
-        "--block", type=int, default=_BLOCK, metavar="N", help="registrations of one task"
+        "--block", type=positive, default=_BLOCK, metavar="N", help="registrations of one task"
     )
 
 
@@ -97,8 +99,6 @@ def _sampler(arguments: argparse.Namespace, config: Config) -> Iterator[Sampler 
     if not arguments.scheduler:
         yield None
         return
-    if arguments.block < 1:
-        raise ConfigError(f"--block must be at least 1: {arguments.block}")
     if config.sampling.n_views > 1:
         raise ConfigError("sampling.n_views needs the simulated world: leave --scheduler out")
     import logging
@@ -171,7 +171,7 @@ def _sampling(config: Config, arguments: argparse.Namespace) -> SamplingConfig:
 
 
 def _samples(text: str) -> int | str:
-    return text if text == "adaptive" else int(text)
+    return text if text == "adaptive" else positive(text)
 
 
 def _summary(outcomes: Counter[str]) -> str:

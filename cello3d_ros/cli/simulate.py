@@ -9,8 +9,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from cello3d_ros.cli.arguments import add_seed_argument, positive
 from cello3d_ros.cli.sources import check_folder, with_progress
-from cello3d_ros.errors import RecordingError
+from cello3d_ros.errors import RecordingError, counted
 from cello3d_ros.simulation.drives import MOTIONS, Drive
 from cello3d_ros.simulation.products import SCANNERS
 from cello3d_ros.simulation.rescan import KEY, told
@@ -23,12 +24,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
     names = ", ".join(WORLDS)
     parser.add_argument("world", metavar="WORLD", type=_world, help=f"{names} or a YAML file")
-    parser.add_argument("--seed", type=int, default=0, help="seed of layout, path and noise")
+    add_seed_argument(parser, "of layout, path and noise")
     parser.add_argument(
-        "--seeds", type=int, metavar="N", help="N bags OUT/WORLD-SEED, of this and later seeds"
+        "--seeds",
+        type=positive,
+        metavar="N",
+        help="N bags OUT/WORLD-SEED, of this and later seeds",
     )
     parser.add_argument(
-        "--scans", type=int, help="number of scans (25; with --path all of its poses)"
+        "--scans",
+        type=positive,
+        metavar="N",
+        help="number of scans (25; with --path all of its poses)",
     )
     parser.add_argument(
         "--drive",
@@ -62,8 +69,6 @@ def run(arguments: argparse.Namespace) -> None:
 
     scanner, drive = _configured(arguments)
     n_seeds = 1 if arguments.seeds is None else arguments.seeds
-    if n_seeds < 1:
-        raise RecordingError(f"--seeds must be at least 1: {n_seeds}")
     if arguments.seeds is None:
         check_folder(arguments.out)
     if arguments.scans is None:
@@ -77,7 +82,7 @@ def run(arguments: argparse.Namespace) -> None:
         provenance = {"made_by": _command(arguments, seed), KEY: told(simulation)}
         odometry = ODOMETRY_PER_SCAN if drive is None else simulation.track()
         write_bag(out, progress, odometry=odometry, provenance=provenance)
-        print(f"{out}: {len(simulation)} scans of {simulation.name}")
+        print(f"{out}: {counted(len(simulation), 'scan')} of {simulation.name}")
 
 
 def _configured(arguments: argparse.Namespace) -> tuple[Scanner, Drive | None]:

@@ -8,8 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cello3d_ros.config import PIPELINES
-from cello3d_ros.errors import RecordingError
+from cello3d_ros.errors import RecordingError, counted
 
 if TYPE_CHECKING:
     from cello3d_ros.recordings import Recording
@@ -61,16 +60,6 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_pipeline_argument(parser: argparse.ArgumentParser, default: str) -> None:
-    """Declare the option that names a pipeline; default: where the settings are from without."""
-    parser.add_argument(
-        "--pipeline",
-        choices=tuple(PIPELINES),
-        default="",
-        help=f"settings of clouds and ICP, in place of {default}",
-    )
-
-
 def check_folder(out: Path) -> None:
     """Refuse a folder named like a file: ``bag.mcap`` would become ``bag.mcap/bag.mcap.mcap``."""
     if out.suffix.lower() in _FILES:
@@ -118,7 +107,7 @@ def open_source(path: Path, arguments: argparse.Namespace) -> Recording:
 def in_words(skipped: dict[str, int]) -> str:
     """Return what was left out of a recording as the end of a sentence, "" if nothing was."""
     return "".join(
-        f"; {n} {'message' if n == 1 else 'messages'} left out: {reason.replace('_', ' ')}"
+        f"; {counted(n, 'message')} left out: {reason.replace('_', ' ')}"
         for reason, n in skipped.items()
     )
 

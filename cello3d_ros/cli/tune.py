@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cello3d_ros.errors import Cello3dError
+from cello3d_ros.atomic import check_outputs
+from cello3d_ros.cli.arguments import add_jobs_argument, positive
 
 if TYPE_CHECKING:
     from cello3d_ros.learning.tune import Tuning
@@ -35,12 +35,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="ground truth: joint poses found in the clouds (docs/align.md), or as recorded",
     )
     parser.add_argument(
-        "--samples", type=int, default=200, metavar="N", help="registrations of each pair (200)"
+        "--samples",
+        type=positive,
+        default=200,
+        metavar="N",
+        help="registrations of each pair (200)",
     )
-    parser.add_argument("--max-gap", type=int, metavar="G", help="largest j - i of a pair")
-    parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="threads"
-    )
+    parser.add_argument("--max-gap", type=positive, metavar="G", help="largest j - i of a pair")
+    add_jobs_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -54,8 +56,7 @@ def run(arguments: argparse.Namespace) -> None:
     from cello3d_ros.learning.tune import tune
 
     out = arguments.out
-    if out.is_dir() or not out.absolute().parent.is_dir():
-        raise Cello3dError(f"cannot write the model {out}: not a file in an existing folder")
+    check_outputs([out], [arguments.recording])
     model = load_model(find_model(arguments.model))
     folder = out.with_name(f"{out.name}.dataset")
     wanted = {"n_samples": arguments.samples, "max_gap": arguments.max_gap}

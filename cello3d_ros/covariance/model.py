@@ -249,6 +249,8 @@ def load_model(name: Path | str = "general") -> Model:
     Raises ModelError naming the file and what is wrong.
     """
     path = find_model(name)
+    if not path.exists():
+        raise ModelError(f"{path}: no such model file; shipped are {', '.join(SHIPPED)}")
     header = _read_header(path)
     is_new = header["format_version"] > 2
     names = (*_ARRAYS, *_NEW_ARRAYS) if is_new else _ARRAYS

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cello3d_ros.config import differences
 from cello3d_ros.covariance.case import MethodSettings
 from cello3d_ros.covariance.methods import METHODS, extra_runs, mean_example
 from cello3d_ros.covariance.model import Model, placed
@@ -21,6 +20,7 @@ from cello3d_ros.learning.dataset import Dataset
 from cello3d_ros.learning.examples import (
     Examples,
     answers,
+    check_settings,
     load_examples,
     places,
     select_inputs,
@@ -94,7 +94,9 @@ def from_dataset(
     Raises DatasetError where the dataset's settings are not the model's: its descriptors would not
     be comparable.
     """
-    _check_settings(model, examples)
+    check_settings(model, examples)
+    if model.shape != "none" and model.shape not in examples.shapes:
+        raise DatasetError(f"the dataset does not hold the {model.shape} of each pair")
     examples = select_inputs(examples, model.features)
     n = len(examples.covariances)
     found, mean_of_examples = answers(model, examples), mean_example(model)
@@ -115,16 +117,6 @@ def from_dataset(
     if "sandwich" in examples.shapes:
         covariances["sandwich"] = examples.shapes["sandwich"]
     return Predictions(covariances, {})
-
-
-def _check_settings(model: Model, examples: Examples) -> None:
-    found = differences(examples.pipeline, model.pipeline)
-    if model.features == "global":
-        found = [difference for difference in found if not difference.startswith("grid.")]
-    if found:
-        raise DatasetError(f"the dataset does not go with the model: {found[0]}")
-    if model.shape != "none" and model.shape not in examples.shapes:
-        raise DatasetError(f"the dataset does not hold the {model.shape} of each pair")
 
 
 def add_answers(

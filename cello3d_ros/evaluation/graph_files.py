@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from cello3d_ros.atomic import new_file
+from cello3d_ros.atomic import check_outputs, new_file
 from cello3d_ros.errors import RecordingError
 from cello3d_ros.evaluation.graph import Graph, Pairs
 from cello3d_ros.geometry.gaussian import rotation_first, symmetrized
@@ -42,14 +41,10 @@ def read_loops(path: Path) -> Pairs:
 
 
 def check_graph_file(path: Path) -> None:
-    """Raise RecordingError where a graph cannot be written to a path."""
+    """Raise RecordingError or WriteError where a graph cannot be written to a path."""
     if path.suffix not in WRITERS:
         raise RecordingError(f"{path}: a graph is written as {', '.join(WRITERS)}")
-    folder = path.absolute().parent
-    if path.is_dir() or not folder.is_dir():
-        raise RecordingError(f"cannot write {path}: not a file in an existing folder")
-    if not os.access(folder, os.W_OK):
-        raise RecordingError(f"cannot write {path}: its folder cannot be written to")
+    check_outputs([path])
 
 
 def write_graph(graph: Graph, path: Path) -> None:

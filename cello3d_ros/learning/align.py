@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from cello3d_ros.atomic import new_file
 from cello3d_ros.clouds.shape import Cloud, with_shape
 from cello3d_ros.config import Pipeline
-from cello3d_ros.errors import CloudError, RecordingError
+from cello3d_ros.errors import CloudError, RecordingError, counted
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array, adjoint, exp, inverse, log
 from cello3d_ros.learning.align_carried import Carried, carried_of
@@ -167,15 +168,28 @@ def align(
     with ExitStack() as stack:
         if folder is None:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="align-")))
-        folder.mkdir(parents=True, exist_ok=True)
         store = ScanStore(folder, 4 * N_BEFORE + 2)
         key = _key(recording, pipeline, start, seed)
         state = _load(folder, key)
         if state is None:
-            state = _begin(recording, pipeline, start, store, seed, progress)
-            _save(folder, key, state)
+            with _kept_if_begun(folder):
+                state = _begin(recording, pipeline, start, store, seed, progress)
+                _save(folder, key, state)
         _sweep(state, store, pipeline, folder, key, seed, n_threads, progress)
     return _finished(recording.name, state)
+
+
+@contextmanager
+def _kept_if_begun(folder: Path) -> Iterator[None]:
+    """Make a folder, and remove it where its first state is not reached: nothing can go on."""
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for path in made:
+            shutil.rmtree(path, ignore_errors=True)
+        raise
 
 
 def _begin(
@@ -241,7 +255,7 @@ def _start_pose(scan: Scan, start: PoseTrack | None) -> Array | None:
 
 def _nothing(name: str, n: int, reasons: dict[int, str]) -> str:
     if n < 3:
-        return f"{name} has {n} {'scan' if n == 1 else 'scans'}; aligning needs at least 3"
+        return f"{name} has {counted(n, 'scan')}; aligning needs at least 3"
     counts: dict[str, int] = {}
     for reason in reasons.values():
         counts[reason] = counts.get(reason, 0) + 1

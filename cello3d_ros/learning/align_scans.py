@@ -47,7 +47,7 @@ class ScanStore:
     """
 
     def __init__(self, folder: Path, n_cached: int) -> None:
-        """folder: where the files are, existing."""
+        """folder: where the files are."""
         self.folder = folder
         self._n_cached = n_cached
         self._cache: OrderedDict[tuple[int, int], _Single] = OrderedDict()

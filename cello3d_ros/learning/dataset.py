@@ -262,7 +262,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     file = path / "manifest.json"
     try:
         manifest = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise DatasetError(f"{path} is not a dataset: it has no manifest.json") from None
     except (OSError, ValueError) as error:
         raise DatasetError(f"cannot read {file}: {error}") from None

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cello3d_ros.config import Pipeline, SamplingConfig, differences
+from cello3d_ros.config import Pipeline, SamplingConfig, differences, pipeline_name
 from cello3d_ros.covariance.features import model_inputs
 from cello3d_ros.covariance.heading import blended, into_motion, motion_of, out_of_motion
 from cello3d_ros.covariance.model import Model, Prediction, predict
@@ -185,6 +185,18 @@ def feature_scaler(examples: Examples) -> tuple[Array, Array, Indices]:
     mean, std = X.mean(axis=0), X.std(axis=0)
     varies = std > 1e-6 * (np.abs(mean) + 1e-6)
     return mean, np.where(varies, std, 1.0), np.flatnonzero(varies)
+
+
+def check_settings(model: Model, examples: Examples) -> None:
+    """Raise DatasetError where pairs were sampled with other settings than a model's."""
+    found = differences(examples.pipeline, model.pipeline)
+    if model.features == "global":
+        found = [difference for difference in found if not difference.startswith("grid.")]
+    if found:
+        raise DatasetError(
+            f"the dataset was sampled with other settings than the model's (pipeline "
+            f"{pipeline_name(model.pipeline)}): {found[0]}"
+        )
 
 
 def _check_alike(ours: Dataset, theirs: Dataset) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from threadpoolctl import threadpool_limits
 
 from cello3d_ros.config import Config, pipeline_of
-from cello3d_ros.errors import ConfigError, RecordingError
+from cello3d_ros.errors import ConfigError, RecordingError, counted
 from cello3d_ros.learning.aligned import AlignedPart, pose_facts
 from cello3d_ros.learning.dataset import UNDONE, Dataset, PairRecord, open_dataset
 from cello3d_ros.learning.identity import fingerprint, scan_prints
@@ -95,7 +95,7 @@ def _opened(paths: Sequence[Path | str | Recording], rescan: bool) -> dict[str, 
 def _check_usable(recording: Recording) -> None:
     """Raise RecordingError where a recording can give no pair, before a dataset is begun."""
     if (n_scans := len(recording)) < 2:
-        raise RecordingError(f"{recording.name} has {n_scans} scans, a pair needs two")
+        raise RecordingError(f"{recording.name} has {counted(n_scans, 'scan')}, a pair needs two")
     if not any(scan.T_world_sensor is not None for scan in recording):
         raise RecordingError(f"{recording.name} has no ground truth, sampling needs it")
 

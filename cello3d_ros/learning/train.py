@@ -9,10 +9,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from cello3d_ros.atomic import new_file
+from cello3d_ros.atomic import check_outputs, new_file
 from cello3d_ros.config import TrainingConfig
 from cello3d_ros.covariance.model import save_model
-from cello3d_ros.errors import DatasetError, WriteError
+from cello3d_ros.errors import DatasetError
 from cello3d_ros.learning.dataset import open_dataset
 from cello3d_ros.learning.examples import load_examples
 from cello3d_ros.learning.identity import check_apart, recordings_of
@@ -42,9 +42,8 @@ def train(
     where ``out`` cannot be written.
     """
     out = Path(out)
-    if out.is_dir() or not out.parent.is_dir():
-        raise WriteError(f"cannot write the model {out}: not a file in an existing folder")
     folders = [*datasets, *filter(_is_dataset, validation)]
+    check_outputs([out], folders)
     opened = [open_dataset(path) for path in {Path(f).resolve(): f for f in folders}.values()]
     known = recordings_of(opened)
     split = split_recordings(known, _patterns(validation), _patterns(exclude))

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cello3d_ros.config import differences
 from cello3d_ros.covariance.model import Model, project
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.geometry.gaussian import kl
@@ -19,6 +18,7 @@ from cello3d_ros.learning.dataset import Dataset
 from cello3d_ros.learning.examples import (
     Examples,
     answers,
+    check_settings,
     examples_of,
     flat_features,
     load_examples,
@@ -149,11 +149,7 @@ def _knowing(tuned: Model, model: Model, examples: Examples) -> Model:
 
 
 def _check(model: Model, examples: Examples, n_pairs: int) -> None:
-    found = differences(examples.pipeline, model.pipeline)
-    if model.features == "global":
-        found = [difference for difference in found if not difference.startswith("grid.")]
-    if found:
-        raise DatasetError(f"the dataset does not go with the model: {found[0]}")
+    check_settings(model, examples)
     if n_pairs < _FEWEST_PAIRS:
         raise DatasetError(f"{n_pairs} pairs can be used, tuning needs at least {_FEWEST_PAIRS}")
     if not np.array_equal(examples.rotations_rad, model.rotations_rad):

@@ -73,6 +73,17 @@ def test_json_holds_the_same_for_a_machine(
     assert "mean_sigmas_m" not in found
 
 
+def test_a_table_counts_the_fingerprints_that_json_lists(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    info.run(parsed("general"))
+    lines = capsys.readouterr().out.splitlines()
+    (row,) = (line.split(maxsplit=1) for line in lines if line.strip().startswith("prints"))
+    info.run(parsed("general", "--json"))
+    prints = json.loads(capsys.readouterr().out)["provenance"]["prints"]
+    assert row[1] == f"of {len(prints)} recordings (--json shows them)"
+
+
 def test_a_path_of_no_known_kind_is_an_error_that_names_the_kinds(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     with pytest.raises(Cello3dError, match=r"notes.txt is not a model file \(\.npz\)"):

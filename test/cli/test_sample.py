@@ -370,7 +370,7 @@ def test_python_samples_trains_and_evaluates_as_the_verbs_do(tmp_path, recording
     assert f"covariances are {found.methods['cello3d'].verdict} " in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("n_scans", "words"), [(3, "no ground truth"), (1, "1 scans, a pair")])
+@pytest.mark.parametrize(("n_scans", "words"), [(3, "no ground truth"), (1, "1 scan, a pair")])
 def test_a_recording_that_gives_no_pair_begins_no_dataset(tmp_path, capsys, n_scans, words):
     scans = [Scan(stamp_ns=k + 1, points=np.ones((9, 3))) for k in range(n_scans)]
     write_bag(tmp_path / "bare", scans)

@@ -455,7 +455,7 @@ def test_a_model_goes_nowhere_where_there_is_no_folder(tmp_path: Path) -> None:
 
 
 def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
-    assert "No such file" in refused(tmp_path / "none.npz")
+    assert "no such model file; shipped are general" in refused(tmp_path / "none.npz")
     assert "cannot read" in refused(tmp_path)
 
 

@@ -40,19 +40,19 @@ def test_the_bag_holds_the_simulation(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize(
-    "words", [["moon"], ["rooms", "--scanner", "x"], ["rooms", "--seed", "a"]]
+    "words",
+    [
+        ["moon"],
+        ["rooms", "--scanner", "x"],
+        ["rooms", "--seed", "a"],
+        ["rooms", "--seed", "-1"],
+        ["rooms", "--scans", "0"],
+    ],
 )
 def test_wrong_arguments_are_usage_errors(words: list[str], tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as caught:
         parsed(*words, "--out", str(tmp_path / "bag"))
     assert caught.value.code == 2
-
-
-@pytest.mark.parametrize("words", [["--scans", "0"], ["--seed", "-1"]])
-def test_values_out_of_range_are_errors(words: list[str], tmp_path: Path) -> None:
-    with pytest.raises(RecordingError):
-        verb.run(parsed("rooms", *words, "--out", str(tmp_path / "bag")))
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_taken_name_is_an_error(tmp_path: Path) -> None:
