@@ -23,7 +23,7 @@ _MANY = 0.03  # share of the points: docs/align.md
 
 
 class Carried(NamedTuple):
-    """share: of the points that move with the sensor; reach_m: range within which 95 % are."""
+    """share: of the points that move with the sensor; reach_m: range within which 80 % are."""
 
     share: float
     reach_m: float
@@ -54,7 +54,7 @@ def carried_of(
     if not shares:
         return None
     found = np.concatenate(ranges)
-    reach_m = float(np.quantile(found, 0.95)) if len(found) else 0.0
+    reach_m = float(np.quantile(found, 0.8)) if len(found) else 0.0
     return Carried(float(np.median(shares)), reach_m)
 
 
