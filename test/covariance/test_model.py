@@ -689,7 +689,7 @@ def test_the_papers_model_has_its_form_and_was_trained_on_its_seven_sequences() 
     assert model.features == "descriptor"
     assert model.shape == "none"
     assert model.frame == "sensor"
-    assert model.mean_weight == 0.0
+    assert model.mean_weight == 0.1
     assert model.margin == 1.0
     assert model.lost is None
     assert pipeline_name(model.pipeline) == "paper"
