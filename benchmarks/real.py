@@ -24,6 +24,7 @@ from cello3d_ros.covariance.lost import is_lost
 from cello3d_ros.covariance.model import Model, find_model, load_model
 from cello3d_ros.errors import Cello3dError
 from cello3d_ros.learning.align_report import sentences
+from cello3d_ros.learning.align_sweeps import AlignSettings
 from cello3d_ros.learning.aligned import aligned_parts
 from cello3d_ros.learning.dataset import open_dataset
 from cello3d_ros.learning.examples import answers, load_examples, select_inputs
@@ -49,9 +50,8 @@ def sampled(path: Path, cache: Path, model: Model, arguments: argparse.Namespace
     if path.name.startswith(EXACT):
         sample([path], folder, config, arguments.jobs)
         return {"sigma_m": 0.0, "n_left_out": 0, "told": []}
-    parts = aligned_parts(
-        open_recording(path), cache / f"{path.name}.joint", model.pipeline, arguments.jobs
-    )
+    settings = AlignSettings(model.pipeline, n_threads=arguments.jobs)
+    parts = aligned_parts(open_recording(path), cache / f"{path.name}.joint", settings)
     found = parts[0].alignment
     sample(parts, folder, config, arguments.jobs)
     return {

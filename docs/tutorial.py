@@ -36,7 +36,7 @@ def executed(folder: Path | str) -> nbformat.NotebookNode:
 
 
 def _printed(cell: nbformat.NotebookNode) -> str:
-    """Return what a cell has printed, without progress bars, colours and the place of this folder."""
+    """Return what a cell has printed, without bars, colours and the place of this folder."""
     text = "".join(o.text for o in cell.outputs if o.output_type == "stream")
     text = re.sub(r"\x1b\[[0-9;]*[A-Za-z]", "", text)  # colours and cursor of a terminal
     lines = [line.rsplit("\r", 1)[-1].rstrip() for line in text.replace("\r\n", "\n").split("\n")]

@@ -43,6 +43,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     from cello3d_ros.learning.align import align
     from cello3d_ros.learning.align_report import as_dict, sentences, write_poses
+    from cello3d_ros.learning.align_sweeps import AlignSettings
     from cello3d_ros.recordings.start_poses import start_track
 
     outputs = [path for path in (arguments.out, arguments.report) if path is not None]
@@ -52,14 +53,8 @@ def run(arguments: argparse.Namespace) -> None:
     start = None if poses is None else start_track(poses, recording)
     folder = arguments.out.with_name(f".{arguments.out.name}.align")
     with bar(recording.name) as progress, threadpool_limits(1, user_api="blas"):
-        found = align(
-            recording,
-            start=start,
-            folder=folder,
-            seed=arguments.seed,
-            n_threads=arguments.jobs,
-            progress=progress,
-        )
+        settings = AlignSettings(seed=arguments.seed, n_threads=arguments.jobs)
+        found = align(recording, settings, start, folder=folder, progress=progress)
     written = write_poses(arguments.out, found, recording.n_declared)
     if arguments.report is not None:
         _write_json(arguments.report, as_dict(found))
@@ -85,15 +80,17 @@ def joint(
 
     from cello3d_ros.config import pipeline_of
     from cello3d_ros.learning.align_report import sentences
+    from cello3d_ros.learning.align_sweeps import AlignSettings
     from cello3d_ros.learning.aligned import aligned_parts, joint_folder
     from cello3d_ros.recordings import open_recording
 
+    settings = AlignSettings(pipeline_of(config), n_threads=n_threads)
     found: list[Recording] = []
     for path in paths:
         recording = open_recording(path)
         folder = joint_folder(dataset, recording.name)
         with bar(recording.name) as progress, threadpool_limits(1, user_api="blas"):
-            parts = aligned_parts(recording, folder, pipeline_of(config), n_threads, progress)
+            parts = aligned_parts(recording, folder, settings, progress)
         print("\n".join(sentences(parts[0].alignment)))
         found += parts
     return found
@@ -117,10 +114,11 @@ def posed(
 
     from cello3d_ros.learning.align import align
     from cello3d_ros.learning.align_report import sentences
+    from cello3d_ros.learning.align_sweeps import AlignSettings
     from cello3d_ros.learning.aligned import AlignedPart
 
     with bar(recording.name) as progress, threadpool_limits(1, user_api="blas"):
-        found = align(recording, n_threads=n_threads, progress=progress)
+        found = align(recording, AlignSettings(n_threads=n_threads), progress=progress)
     print("\n".join(sentences(found)))
     return AlignedPart(recording, found)
 

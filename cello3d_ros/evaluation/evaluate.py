@@ -29,6 +29,7 @@ from cello3d_ros.evaluation.comparison import (
 from cello3d_ros.evaluation.online import answers, prepared
 from cello3d_ros.evaluation.result import Evaluation, Group, Pair, Poses, ShownPair, Trajectory
 from cello3d_ros.evaluation.trajectories import consistency, length_m, odometry_runs, shown
+from cello3d_ros.learning.align_sweeps import AlignSettings
 from cello3d_ros.learning.aligned import aligned_parts, joint_folder
 from cello3d_ros.learning.dataset import UNDONE, Dataset, open_dataset
 from cello3d_ros.learning.examples import Examples, load_examples
@@ -180,7 +181,7 @@ def _recordings(
                 found[recording.name] = without_motion(recording)
             if dataset.recordings.get(recording.name, {}).get("poses") == "joint":
                 folder = joint_folder(dataset.path, recording.name)
-                parts = aligned_parts(recording, folder, dataset.pipeline)
+                parts = aligned_parts(recording, folder, AlignSettings(dataset.pipeline))
                 found |= {part.name: part for part in parts if part.name in names}
     return list(found.values())
 

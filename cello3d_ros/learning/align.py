@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from cello3d_ros.atomic import new_file
 from cello3d_ros.clouds.shape import Cloud, with_shape
-from cello3d_ros.config import Pipeline
 from cello3d_ros.errors import CloudError, RecordingError, counted
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.geometry.se3 import Array, adjoint, exp, inverse, log
@@ -35,6 +34,7 @@ from cello3d_ros.learning.align_scans import ScanStore, ShapedScan, filtered_sca
 from cello3d_ros.learning.align_smear import Smear, smear_of
 from cello3d_ros.learning.align_sweeps import (
     N_BEFORE,
+    AlignSettings,
     cloud_of,
     motion_of,
     neighbors_of,
@@ -61,6 +61,8 @@ _FACTS = (
     *("sweep", "position", "is_last", "is_done", "moves_m", "compensated", "smear", "carried"),
 )
 _ARRAYS = ("stamps_ns", "keyframes", "held", "moved", "halves", "first_poses", "pairs")
+
+_DEFAULTS = AlignSettings()
 
 Progress = Callable[[int, int], None]  # scans visited so far, and in all as far as known
 
@@ -148,12 +150,10 @@ class _State:
 
 def align(
     recording: Recording,
-    pipeline: Pipeline | None = None,
+    settings: AlignSettings = _DEFAULTS,
     start: PoseTrack | None = None,
     *,
     folder: Path | None = None,
-    seed: int = 0,
-    n_threads: int = 1,
     progress: Progress = lambda done, total: None,
 ) -> Alignment:
     """Find the poses of a recording's scans from the scans.
@@ -164,18 +164,17 @@ def align(
     on the recording, start and seed alone.
     Raises RecordingError when fewer than 3 scans hold to one another.
     """
-    pipeline = pipeline or Pipeline()
     with ExitStack() as stack:
         if folder is None:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="align-")))
         store = ScanStore(folder, 4 * N_BEFORE + 2)
-        key = _key(recording, pipeline, start, seed)
+        key = _key(recording, settings, start)
         state = _load(folder, key)
         if state is None:
             with _kept_if_begun(folder):
-                state = _begin(recording, pipeline, start, store, seed, progress)
+                state = _begin(recording, settings, start, store, progress)
                 _save(folder, key, state)
-        _sweep(state, store, pipeline, folder, key, seed, n_threads, progress)
+        _sweep(state, store, settings, folder, key, progress)
     return _finished(recording.name, state)
 
 
@@ -194,10 +193,9 @@ def _kept_if_begun(folder: Path) -> Iterator[None]:
 
 def _begin(
     recording: Recording,
-    pipeline: Pipeline,
+    settings: AlignSettings,
     start: PoseTrack | None,
     store: ScanStore,
-    seed: int,
     progress: Progress,
 ) -> _State:
     """Read all scans once, keep them in the store and build the chain."""
@@ -217,22 +215,37 @@ def _begin(
                 reasons[k] = "repeats the scan before"
                 continue
             try:
-                raw = filtered_scan(scan, pipeline.cloud, np.random.default_rng([seed, k]))
+                cloud, has_times = _stored(k, scan, settings, store)
             except CloudError as error:
                 reasons[k] = str(error)
                 continue
             last = digest
-            compensated |= raw.time_s is not None
-            store.add_raw(k, raw)
-            cloud = with_shape(cloud_of(raw.points), pipeline.cloud)
-            store.add_shaped(k, 0, ShapedScan(cloud.points, cloud.normals))
+            compensated |= has_times
             yield Placed(k, scan.stamp_ns, cloud, _start_pose(scan, start))
 
-    chain = build_chain(scans(), n, pipeline.icp, seed)
+    chain = build_chain(scans(), n, settings.pipeline.icp, settings.seed)
     for k in np.flatnonzero(chain.part < 0):
         reasons.setdefault(int(k), "holds to none of the scans around it")
     if not (chain.part >= 0).any():
         raise RecordingError(_nothing(recording.name, n, reasons))
+    return _first_state(chain, reasons, stamps, compensated)
+
+
+def _stored(k: int, scan: Scan, settings: AlignSettings, store: ScanStore) -> tuple[Cloud, bool]:
+    """Keep scan k; return its cloud and whether its points have times.  Raises CloudError."""
+    pipeline, seed, _ = settings
+    raw = filtered_scan(scan, pipeline.cloud, np.random.default_rng([seed, k]))
+    store.add_raw(k, raw)
+    cloud = with_shape(cloud_of(raw.points), pipeline.cloud)
+    store.add_shaped(k, 0, ShapedScan(cloud.points, cloud.normals))
+    return cloud, raw.time_s is not None
+
+
+def _first_state(
+    chain: Chain, reasons: dict[int, str], stamps: NDArray[np.int64], compensated: bool
+) -> _State:
+    """Return the state before the first sweep."""
+    n = len(stamps)
     return _State(
         chain=chain,
         reasons=reasons,
@@ -286,11 +299,9 @@ def _keyframes(chain: Chain) -> NDArray[np.bool_]:
 def _sweep(
     state: _State,
     store: ScanStore,
-    pipeline: Pipeline,
+    settings: AlignSettings,
     folder: Path,
     key: str,
-    seed: int,
-    n_threads: int,
     progress: Progress,
 ) -> None:
     """Visit all scans until they rest; goes on where the state says."""
@@ -303,7 +314,7 @@ def _sweep(
         order = members if state.sweep % 2 else members[::-1]
         done = set(order[: state.position].tolist())
         for k in order[state.position :].tolist():
-            _visit(state, store, pipeline, k, done, seed, n_threads)
+            _visit(state, store, settings, k, done)
             done.add(k)
             state.position += 1
             progress(n * state.sweep + state.position, n * (1 + MAX_SWEEPS))
@@ -317,8 +328,8 @@ def _sweep(
         state.sweep, state.position = state.sweep + 1, 0
         state.is_last = rests or state.sweep == MAX_SWEEPS
         _save(folder, key, state)
-    _register_pairs(state, store, pipeline, seed)
-    _look_at_scans(state, store, seed)
+    _register_pairs(state, store, settings)
+    _look_at_scans(state, store, settings.seed)
     state.is_done = True
     _save(folder, key, state)
     store.clear()
@@ -331,13 +342,7 @@ def _median_move(moved: Array, part: NDArray[np.int64]) -> float:
 
 
 def _visit(
-    state: _State,
-    store: ScanStore,
-    pipeline: Pipeline,
-    k: int,
-    done: set[int],
-    seed: int,
-    n_threads: int,
+    state: _State, store: ScanStore, settings: AlignSettings, k: int, done: set[int]
 ) -> None:
     """Register a scan to its neighbours.
 
@@ -358,7 +363,7 @@ def _visit(
     if is_first and not neighbors:
         store.add_shaped(k, sweep, store.shaped(k, sweep - 1))
         return
-    found = visit(k, chain.poses, neighbors, own, pipeline, seed, state.is_last, n_threads)
+    found = visit(k, chain.poses, neighbors, own, settings, state.is_last)
     if is_first:
         after = members[members > k]
         moved = exp(log(found.T @ inverse(chain.poses[k])))  # a rotation to rounding
@@ -370,7 +375,7 @@ def _visit(
     store.add_shaped(k, sweep, found.shaped)
 
 
-def _register_pairs(state: _State, store: ScanStore, pipeline: Pipeline, seed: int) -> None:
+def _register_pairs(state: _State, store: ScanStore, settings: AlignSettings) -> None:
     """Register each scan to the one before it alone, from the joint poses."""
     chain = state.chain
     for p in range(int(chain.part.max()) + 1):
@@ -382,8 +387,8 @@ def _register_pairs(state: _State, store: ScanStore, pipeline: Pipeline, seed: i
                     scan = store.shaped(k, state.sweep)
                     clouds[k] = cloud_of(scan.points, scan.normals)
             T = inverse(chain.poses[i]) @ chain.poses[j]
-            rng = np.random.default_rng([seed, j, i])
-            found = register(clouds[j], clouds.pop(i), T, pipeline.icp, rng)
+            rng = np.random.default_rng([settings.seed, j, i])
+            found = register(clouds[j], clouds.pop(i), T, settings.pipeline.icp, rng)
             state.pairs[j] = log(inverse(T) @ found.T_ref_read)
 
 
@@ -483,8 +488,9 @@ def _spread(halves: Array) -> Array:
     return np.asarray(_FACTOR**2 * 0.5 * (local + even) + floor)
 
 
-def _key(recording: Recording, pipeline: Pipeline, start: PoseTrack | None, seed: int) -> str:
+def _key(recording: Recording, settings: AlignSettings, start: PoseTrack | None) -> str:
     """Return what tells apart alignments: recording, settings and start."""
+    pipeline, seed, _ = settings
     digest = hashlib.sha256(f"{fingerprint(recording)} {len(recording)} {seed}".encode())
     digest.update(repr((pipeline.cloud, pipeline.icp, _VERSION)).encode())
     for stamp_ns, T in start or ():

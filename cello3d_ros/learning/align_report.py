@@ -108,6 +108,19 @@ def sentences(alignment: Alignment) -> Iterator[str]:
         )
     if alignment.compensated:
         yield "the motion within each scan was undone"
+    yield from _warnings(alignment)
+    grouped: dict[str, list[int]] = {}
+    for k, reason in alignment.reasons.items():
+        grouped.setdefault(reason, []).append(k)
+    for reason, scans in grouped.items():
+        more = f" and {len(scans) - _MOST_NAMED} more" if len(scans) > _MOST_NAMED else ""
+        named = ", ".join(map(str, scans[:_MOST_NAMED]))
+        word = "scan" if len(scans) == 1 else "scans"
+        yield f"left out: {word} {named}{more}: {reason}"
+
+
+def _warnings(alignment: Alignment) -> Iterator[str]:
+    """Yield what is wrong with the scans."""
     smear = alignment.smear
     if smear is not None and smear.is_smeared:
         yield (
@@ -123,11 +136,3 @@ def sentences(alignment: Alignment) -> Iterator[str]:
             f"them within {carried.reach_m:.1f} m: what carries it pulls registrations towards no "
             "motion; leave it out by cloud.min_range_m"
         )
-    grouped: dict[str, list[int]] = {}
-    for k, reason in alignment.reasons.items():
-        grouped.setdefault(reason, []).append(k)
-    for reason, scans in grouped.items():
-        more = f" and {len(scans) - _MOST_NAMED} more" if len(scans) > _MOST_NAMED else ""
-        named = ", ".join(map(str, scans[:_MOST_NAMED]))
-        word = "scan" if len(scans) == 1 else "scans"
-        yield f"left out: {word} {named}{more}: {reason}"

@@ -24,6 +24,14 @@ _CELL_M = 0.1  # side of the cells whose means make normals: docs/align.md
 _MAX_MOVE_M, _MAX_MOVE_RAD = 1.0, 0.3  # a scan that a sweep moves farther does not hold
 
 
+class AlignSettings(NamedTuple):
+    """How scans are registered; n_threads changes no bit."""
+
+    pipeline: Pipeline = Pipeline()
+    seed: int = 0
+    n_threads: int = 1
+
+
 class Visit(NamedTuple):
     """What one scan's registration to its neighbours gave.
 
@@ -68,10 +76,8 @@ def visit(
     poses: Array,
     neighbors: dict[int, ShapedScan],
     own: Array,
-    pipeline: Pipeline,
-    seed: int,
+    settings: AlignSettings,
     wants_halves: bool,
-    n_threads: int = 1,
 ) -> Visit:
     """Register scan k to the union of its neighbours, and find the normals of its points.
 
@@ -83,23 +89,18 @@ def visit(
     if not neighbors:
         alone = ShapedScan(own, np.zeros_like(own))
         return Visit(poses[k], np.zeros(6), 0.0, False, np.zeros(6), alone)
-    icp = sweep_icp(pipeline.icp)
-    reading = cloud_of(own)
-    union = gathered(poses[k], poses, neighbors)
+    pipeline, seed, n_threads = settings
+    reading, union = cloud_of(own), gathered(poses[k], poses, neighbors)
     rng = np.random.default_rng([seed, k])
-    found = register(reading, union, np.eye(4), icp, rng)
+    found = register(reading, union, np.eye(4), sweep_icp(pipeline.icp), rng)
     moved = log(found.T_ref_read)
     share = share_on_surfaces(reading, union, found.T_ref_read, rng)
-    holds = (
-        found.has_answer
-        and share >= MIN_SHARE
-        and float(np.linalg.norm(moved[:3])) < _MAX_MOVE_M
-        and float(np.linalg.norm(moved[3:])) < _MAX_MOVE_RAD
-    )
+    is_near = np.linalg.norm(moved[:3]) < _MAX_MOVE_M and np.linalg.norm(moved[3:]) < _MAX_MOVE_RAD
+    holds = found.has_answer and share >= MIN_SHARE and bool(is_near)
     step = exp(moved) if holds else np.eye(4)
     halves = np.zeros(6)
     if wants_halves and holds and len(neighbors) >= 2:
-        halves = _halves(k, poses, neighbors, reading, step, icp, seed)
+        halves = _halves(k, poses, neighbors, reading, step, settings)
     points = transform(step, reading.points)
     surface = build_tree(cell_means(np.concatenate([points, union.points]), _CELL_M))
     normals = common_normals(surface, points, pipeline.cloud, n_threads)
@@ -139,14 +140,13 @@ def _halves(
     neighbors: dict[int, ShapedScan],
     reading: Cloud,
     start: Array,
-    icp: IcpConfig,
-    seed: int,
+    settings: AlignSettings,
 ) -> Array:
     """Return ``log(T_a^-1 T_b)`` of the registrations to every other neighbour and to the rest."""
-    found = []
+    found, icp = [], sweep_icp(settings.pipeline.icp)
     for part in (0, 1):
         some = dict(list(neighbors.items())[part::2])
-        rng = np.random.default_rng([seed, k, part])
+        rng = np.random.default_rng([settings.seed, k, part])
         found.append(register(reading, gathered(poses[k], poses, some), start, icp, rng))
     return np.asarray(log(inverse(found[0].T_ref_read) @ found[1].T_ref_read))
 

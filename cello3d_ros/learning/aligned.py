@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cello3d_ros.config import Pipeline
 from cello3d_ros.geometry.pose_track import PoseTrack
 from cello3d_ros.learning.align import Alignment, Progress, align
 from cello3d_ros.learning.align_scans import RawScan, without_motion
-from cello3d_ros.learning.align_sweeps import motion_of
+from cello3d_ros.learning.align_sweeps import AlignSettings, motion_of
 from cello3d_ros.recordings.recording import Recording, Scan
+
+_DEFAULTS = AlignSettings()
 
 
 @dataclass(frozen=True)
@@ -75,15 +76,14 @@ class AlignedPart:
 def aligned_parts(
     recording: Recording,
     folder: Path,
-    pipeline: Pipeline | None = None,
-    n_threads: int = 1,
-    progress: Callable[[int, int], None] | Progress = lambda done, total: None,
+    settings: AlignSettings = _DEFAULTS,
+    progress: Progress = lambda done, total: None,
 ) -> list[AlignedPart]:
     """Align a recording, once for a folder, and return its parts.
 
     folder: keeps the poses; scans are kept there only while they are needed.
     """
-    found = align(recording, pipeline, folder=folder, n_threads=n_threads, progress=progress)
+    found = align(recording, settings, folder=folder, progress=progress)
     return [AlignedPart(recording, found, part) for part in range(found.n_parts)]
 
 

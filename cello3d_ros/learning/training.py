@@ -25,6 +25,7 @@ from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import package_versions
 from cello3d_ros.learning.examples import (
     Examples,
+    Indices,
     feature_scaler,
     flat_features,
     select_inputs,
@@ -88,9 +89,7 @@ def fit(
     if validation is not None:
         validation = select_inputs(validation, config.features)
     _check_groups(examples, validation)
-    mean, scale, active = feature_scaler(examples)
-    if not config.standardize:
-        mean, scale = np.zeros_like(mean), np.ones_like(scale)
+    mean, scale, active = _scaler(examples, config)
     problem = leave_out_problem(examples, config, mean, scale)
     judge = problem
     if validation is not None:
@@ -113,6 +112,14 @@ def fit(
         interrupted=search.interrupted,
         curve=tuple(search.curve),
     )
+
+
+def _scaler(examples: Examples, config: TrainingConfig) -> tuple[Array, Array, Indices]:
+    """Return mean and scale of the features, and which of them vary."""
+    mean, scale, active = feature_scaler(examples)
+    if not config.standardize:
+        mean, scale = np.zeros_like(mean), np.ones_like(scale)
+    return mean, scale, active
 
 
 def _model(

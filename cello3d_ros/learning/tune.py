@@ -74,13 +74,7 @@ def tune(model: Model, dataset: Dataset) -> Tuning:
     examples = select(examples, agrees)
     _check(model, examples, len(keys))
     F = predictions(model, examples)
-    scaled, extended_F = np.full_like(F, np.nan), np.full_like(F, np.nan)
-    for held, rest in _blocks(keys):
-        rest[rest] = _fits(F[rest], select(examples, rest))
-        ours, theirs = select(examples, rest), select(examples, held)
-        scale = _scale(F[rest], ours)
-        scaled[held] = scale * F[held]
-        extended_F[held] = predictions(extended(model, ours, scale), theirs)
+    scaled, extended_F = _cross_validated(model, examples, F, keys)
     judged = np.asarray(np.isfinite(scaled).all(axis=(1, 2)))
     if not judged.any():
         raise DatasetError("the pairs all share scans: no block of time can be held back")
@@ -90,9 +84,8 @@ def tune(model: Model, dataset: Dataset) -> Tuning:
     outliers, fitted = _split(keys, ~fits)
     examples, F = select(examples, fits), F[fits]
     Y = held_back.covariances
-    may_extend = len(fitted) >= _FEWEST_FOR_EXAMPLES
     pays = _mean_kl(Y, extended_F) < _GAIN * _mean_kl(Y, scaled)
-    kind = EXAMPLES if may_extend and pays else SIZE
+    kind = EXAMPLES if pays and len(fitted) >= _FEWEST_FOR_EXAMPLES else SIZE
     scale = _scale(F, examples)
     tuned = extended(model, examples, scale) if kind == EXAMPLES else resized(model, scale)
     tuned = _knowing(tuned, model, examples)
@@ -106,6 +99,24 @@ def tune(model: Model, dataset: Dataset) -> Tuning:
         flagged=tuple(flagged),
         outliers=tuple(outliers),
     )
+
+
+def _cross_validated(
+    model: Model, examples: Examples, F: Array, keys: Sequence[PairKey]
+) -> tuple[Array, Array]:
+    """Return what is said of pairs, (N, 6, 6), by the model tuned to other blocks of time.
+
+    F: (N, 6, 6), what the model says.  Once by its size alone, once with the examples of the other
+    blocks; NaN for pairs that no block holds back.
+    """
+    scaled, extended_F = np.full_like(F, np.nan), np.full_like(F, np.nan)
+    for held, rest in _blocks(keys):
+        rest[rest] = _fits(F[rest], select(examples, rest))
+        ours, theirs = select(examples, rest), select(examples, held)
+        scale = _scale(F[rest], ours)
+        scaled[held] = scale * F[held]
+        extended_F[held] = predictions(extended(model, ours, scale), theirs)
+    return scaled, extended_F
 
 
 def predictions(model: Model, examples: Examples) -> Array:

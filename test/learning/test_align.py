@@ -23,7 +23,12 @@ from cello3d_ros.learning.align_chain import share_on_surfaces
 from cello3d_ros.learning.align_report import sentences
 from cello3d_ros.learning.align_scans import ScanStore, ShapedScan
 from cello3d_ros.learning.align_smear import smear_of
-from cello3d_ros.learning.align_sweeps import cloud_of, common_normals, neighbors_of
+from cello3d_ros.learning.align_sweeps import (
+    AlignSettings,
+    cloud_of,
+    common_normals,
+    neighbors_of,
+)
 from cello3d_ros.recordings.poses import tum_line
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.simulation.drives import Drive
@@ -31,7 +36,7 @@ from cello3d_ros.simulation.products import SCANNERS
 from cello3d_ros.simulation.simulation import Simulation
 
 N_SCANS = 7
-PIPELINE = Pipeline(icp=IcpConfig(n_reading_points=1000))
+SETTINGS = AlignSettings(Pipeline(icp=IcpConfig(n_reading_points=1000)))
 
 
 class Clouds:
@@ -102,7 +107,7 @@ def room() -> tuple[list[Scan], Array, Alignment]:
     """A room, its true poses and its alignment from nothing but the clouds."""
     truth = true_poses()
     scans = scans_of(1, truth)
-    return scans, truth, align(Clouds(scans), PIPELINE)
+    return scans, truth, align(Clouds(scans), SETTINGS)
 
 
 def test_joint_poses_are_nearer_the_truth_than_pairwise_ones(
@@ -122,7 +127,7 @@ def test_alignments_say_how_near_the_truth_they_are(
     room: tuple[list[Scan], Array, Alignment],
 ) -> None:
     _, truth, found = room
-    other = align(Clouds(scans_of(2, truth)), PIPELINE)
+    other = align(Clouds(scans_of(2, truth)), SETTINGS)
     expected = np.mean([alignment.sigmas()[0] ** 2 for alignment in (found, other)])
     errors = np.concatenate([step_errors(alignment, truth) for alignment in (found, other)])
     ratio = np.sqrt(expected / (errors[:, :3] ** 2).sum(axis=1).mean())
@@ -144,13 +149,13 @@ def test_the_same_recording_gives_the_same_bits_with_any_threads_and_after_an_in
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("cello3d_ros.learning.align._SAVE_S", 0.0)
         with pytest.raises(KeyboardInterrupt):
-            align(Clouds(scans), PIPELINE, folder=tmp_path, progress=interrupt)
-        again = align(Clouds(scans), PIPELINE, folder=tmp_path, n_threads=2)
+            align(Clouds(scans), SETTINGS, folder=tmp_path, progress=interrupt)
+        again = align(Clouds(scans), SETTINGS._replace(n_threads=2), folder=tmp_path)
     np.testing.assert_array_equal(again.poses, found.poses)
     np.testing.assert_array_equal(again.covariances, found.covariances)
     other = Clouds(scans_of(2, true_poses()))
     with pytest.raises(RecordingError, match="another recording or start; remove it"):
-        align(other, PIPELINE, folder=tmp_path)
+        align(other, SETTINGS, folder=tmp_path)
 
 
 def test_the_frame_of_the_start_is_kept_and_its_errors_are_not(
@@ -161,7 +166,7 @@ def test_the_frame_of_the_start_is_kept_and_its_errors_are_not(
     rng = np.random.default_rng(3)
     rough = M @ truth @ exp(rng.normal(size=(N_SCANS, 6)) * np.repeat([0.05, 0.01], 3))
     start = PoseTrack.of_poses([scan.stamp_ns for scan in scans], rough)
-    found = align(Clouds(scans), PIPELINE, start)
+    found = align(Clouds(scans), SETTINGS, start)
     np.testing.assert_allclose(found.poses[0], rough[0], atol=1e-9)
     assert np.abs(step_errors(found, truth)[:, :3]).max() < 0.005
     assert found.n_contradicted == 0
@@ -174,7 +179,7 @@ def test_poses_that_contradict_the_clouds_are_counted_and_the_clouds_followed(
     wrong = truth.copy()
     wrong[4:] = truth[4:] @ exp(np.array([0.8, 0.5, 0.0, 0.0, 0.0, 0.4]))
     start = PoseTrack.of_poses([scan.stamp_ns for scan in scans], wrong)
-    found = align(Clouds(scans), PIPELINE, start)
+    found = align(Clouds(scans), SETTINGS, start)
     assert found.n_contradicted == 1
     assert np.abs(step_errors(found, truth)[:, :3]).max() < 0.005
 
@@ -182,7 +187,7 @@ def test_poses_that_contradict_the_clouds_are_counted_and_the_clouds_followed(
 def test_two_places_make_two_parts_and_a_stray_scan_is_left_out() -> None:
     first, second = scans_of(1, true_poses(4)), scans_of(4, true_poses(5), first_ns=10**9)
     stray = replace(scans_of(9, true_poses(1))[0], stamp_ns=950_000_000)
-    found = align(Clouds([*first, stray, *second]), PIPELINE)
+    found = align(Clouds([*first, stray, *second]), SETTINGS)
     assert found.part.tolist() == [1] * 4 + [-1] + [0] * 5
     assert found.reasons == {4: "holds to none of the scans around it"}
 
@@ -194,7 +199,7 @@ def test_empty_and_repeated_scans_are_left_out_by_name(
     bad = list(scans)
     bad[2] = replace(scans[2], points=np.zeros((0, 3)))
     bad[5] = replace(scans[5], points=scans[4].points)
-    found = align(Clouds(bad), PIPELINE)
+    found = align(Clouds(bad), SETTINGS)
     kept = [0, 1, 3, 4, 6]
     assert found.members().tolist() == kept
     assert found.reasons[2].startswith("0 of 0 points are left")
@@ -218,7 +223,7 @@ def test_nothing_is_made_of_too_few_scans(rooms: list[int], sentence: str) -> No
         for k, room in enumerate(rooms)
     ]
     with pytest.raises(RecordingError, match=sentence):
-        align(Clouds(scans), PIPELINE)
+        align(Clouds(scans), SETTINGS)
 
 
 def test_the_motion_within_scans_is_undone() -> None:
@@ -232,8 +237,8 @@ def test_the_motion_within_scans_is_undone() -> None:
         T = inverse(exp(time_s[:, None] / 0.1 * step))
         points = np.einsum("nij,nj->ni", T[:, :3, :3], scan.points) + T[:, :3, 3]
         swept.append(replace(scan, points=points, time_s=time_s))
-    found = align(Clouds(swept), PIPELINE)
-    smeared = align(Clouds([replace(scan, time_s=None) for scan in swept]), PIPELINE)
+    found = align(Clouds(swept), SETTINGS)
+    smeared = align(Clouds([replace(scan, time_s=None) for scan in swept]), SETTINGS)
     assert found.compensated
     assert not smeared.compensated
 
@@ -315,7 +320,7 @@ def test_rings_of_sixteen_beams_do_not_pull_scans_together(tmp_path: Path) -> No
     path.write_text("".join(tum_line((k + 1) * 10**8, T) for k, T in enumerate(truth)))
     seen = Simulation("hall", 13, len(truth), SCANNERS["vlp16"], path)
     scans = [Scan(stamp_ns=scan.stamp_ns, points=scan.points) for scan in seen]
-    found = align(Clouds(scans), Pipeline())
+    found = align(Clouds(scans))
     errors_m = step_errors(found, truth)[:, :3]
     assert not found.reasons
     assert np.sqrt((errors_m**2).sum(axis=1).mean()) < min(0.004, 2.0 * found.sigmas()[0])
@@ -383,7 +388,7 @@ def test_a_long_recording_is_aligned_in_the_memory_of_a_short_one() -> None:
 
     def most_bytes(n: int) -> int:
         tracemalloc.start()
-        align(Long([None] * n), PIPELINE)  # type: ignore[list-item]
+        align(Long([None] * n), SETTINGS)  # type: ignore[list-item]
         most = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return most
@@ -394,6 +399,6 @@ def test_a_long_recording_is_aligned_in_the_memory_of_a_short_one() -> None:
 
 def test_a_sensor_that_stands_still_is_found_to_stand_still() -> None:
     truth = np.tile(np.eye(4), (4, 1, 1))
-    found = align(Clouds(scans_of(1, truth)), PIPELINE)
+    found = align(Clouds(scans_of(1, truth)), SETTINGS)
     assert found.members().tolist() == [0, 1, 2, 3]
     assert np.abs(step_errors(found, truth)[:, :3]).max() < 0.002
