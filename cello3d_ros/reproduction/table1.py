@@ -153,12 +153,14 @@ def _censi(dataset: Dataset, recording: Recording) -> Array:
 
 
 def _table(rows: Sequence[dict[str, Row]]) -> list[list[str]]:
-    """Return the mean divergences."""
-    table = [["sequence", "trained on", "pairs", "baseline", *_HEADS.values(), "Censi"]]
+    """Return the mean divergences, and the paper's baseline and model."""
+    head = ["sequence", "trained on", "pairs", "baseline", *_HEADS.values(), "Censi"]
+    table = [[*head, "paper: baseline", "its model"]]
     for key in rows[0]:
         n_pairs = str(sum(row[key]["baseline"].n_pairs for row in rows))
         cells = [f"{np.mean([_of(row[key][name]) for row in rows]):.3g}" for name in _METHODS]
-        table.append([SEQUENCES[key].title, trained_on(key), n_pairs, *cells])
+        theirs = [f"{SEQUENCES[key].kl_baseline:g}", f"{SEQUENCES[key].kl_ours:g}"]
+        table.append([SEQUENCES[key].title, trained_on(key), n_pairs, *cells, *theirs])
     return table
 
 
