@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from consumer_rules import of_pose, of_twist
+from node_plays import played
 from robot import ellipsoid_of
 from room_walks import InMemory, walk_in_a_room
 
@@ -14,7 +15,6 @@ from cello3d_ros.covariance.lost import Lost
 from cello3d_ros.covariance.model import load_model, save_model, shipped_model_path
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import to_fixed_axes
-from cello3d_ros.ros import replay
 from cello3d_ros.ros.process import NodeProcess
 
 MODES = NodeConfig.__dataclass_fields__["covariance_mode"].metadata["choices"]
@@ -24,20 +24,6 @@ STEP_S = 0.2
 @pytest.fixture(scope="module")
 def recording() -> InMemory:
     return walk_in_a_room(4, STEP_S)
-
-
-def played(tmp_path, domain_id, recording, **settings):
-    """Play through a node of the shipped model; settings of the section node."""
-    parameters = {f"node.{name}": value for name, value in settings.items()}
-    with NodeProcess(tmp_path / "log", domain_id, parameters) as process:
-        player = replay.Player(domain_id, check=process.check)
-        try:
-            found = replay.play(player, recording)
-        finally:
-            player.close()
-        assert process.stop() == 0
-        assert "Traceback" not in process.output()
-    return found
 
 
 @pytest.fixture(scope="module")

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
+from node_plays import played
 from room_walks import InMemory, walk_in_a_room
 
 from cello3d_ros.covariance.estimator import Estimator
 from cello3d_ros.covariance.model import load_model
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import is_positive_definite
-from cello3d_ros.ros import messages, replay
-from cello3d_ros.ros.process import NodeProcess
+from cello3d_ros.ros import messages
 
 
 @pytest.fixture(scope="module")
@@ -20,18 +20,7 @@ def recording() -> InMemory:
 def test_the_node_answers_with_the_papers_model_as_python_does(
     tmp_path, domain_id, recording
 ) -> None:
-    parameters = {
-        "node.model": "paper",
-        "node.inflate_unknown": "false",
-    }
-    with NodeProcess(tmp_path / "log", domain_id, parameters) as process:
-        player = replay.Player(domain_id, check=process.check)
-        try:
-            found = replay.play(player, recording)
-        finally:
-            player.close()
-        assert process.stop() == 0
-        assert "Traceback" not in process.output()
+    found = played(tmp_path, domain_id, recording, model="paper", inflate_unknown="false")
     stamps = [scan.stamp_ns for scan in recording]
     assert list(found.relative) == stamps[1:]
     assert found.last_status["model"] == "paper.npz"
