@@ -27,6 +27,7 @@ _N_SAMPLES = {
     "fig-hallway": 2000,
     "fig-trajectories": 250,
 }
+_FEWEST_SAMPLES = 50  # that a cluster can be told from: learning/clustering.py
 _ON_RECORDINGS = ("table1", "table2", "readings", "fig-trajectories")
 
 
@@ -82,6 +83,8 @@ def _add_places(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Make what was asked for, each published as soon as it is done."""
+    if arguments.samples is not None and arguments.samples < _FEWEST_SAMPLES:
+        raise Cello3dError(f"--samples must be at least {_FEWEST_SAMPLES}: {arguments.samples}")
     if arguments.scans == 1:
         raise Cello3dError("--scans must be at least 2: odometry needs two scans")
     if arguments.data and arguments.places > 1:

@@ -101,6 +101,13 @@ def test_an_output_never_replaces_an_input(line, folder, capsys) -> None:
     assert kept == ["kept"] * 5
 
 
+@pytest.mark.parametrize("samples", [1, 49])
+def test_a_figure_of_too_few_samples_is_refused(samples, folder, capsys) -> None:
+    error = refused(f"reproduce fig-cylinder --out new --samples {samples}", capsys)
+    assert f"--samples must be at least 50: {samples}" in error
+    assert not (folder / "new").exists()
+
+
 def test_one_file_is_not_written_twice(capsys) -> None:
     for line in ("align rec --out a.tum --report a.tum", "graph rec --out a.g2o --out ./a.g2o"):
         assert "written twice" in refused(line, capsys)
