@@ -96,6 +96,11 @@ class Alignment:
     carried: Carried | None = None
 
     @property
+    def rests(self) -> bool:
+        """Whether the last sweep hardly changed the steps."""
+        return not self.moves_m or self.moves_m[-1] < _TOLERANCE_M
+
+    @property
     def n_parts(self) -> int:
         """Number of parts."""
         return int(self.part.max(initial=-1)) + 1

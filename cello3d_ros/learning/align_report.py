@@ -120,7 +120,13 @@ def sentences(alignment: Alignment) -> Iterator[str]:
 
 
 def _warnings(alignment: Alignment) -> Iterator[str]:
-    """Yield what is wrong with the scans."""
+    """Yield what is wrong with the surroundings or the scans."""
+    if not alignment.rests:
+        yield (
+            "warning: the poses do not come to rest, the last sweep changed the median step by "
+            f"{1e3 * alignment.moves_m[-1]:.1f} mm: the surroundings hold the motion weakly, as a "
+            "tunnel does, and errors may be far larger than stated; start from odometry or --poses"
+        )
     smear = alignment.smear
     if smear is not None and smear.is_smeared:
         yield (

@@ -291,6 +291,15 @@ def test_a_vehicle_that_moves_with_the_sensor_is_found(
     assert 1.0 < found.reach_m < 2.5 or not carried
 
 
+def test_poses_that_do_not_come_to_rest_are_named(
+    room: tuple[list[Scan], Array, Alignment],
+) -> None:
+    assert room[2].rests
+    moving = replace(room[2], moves_m=(0.2, 0.05, 0.034))
+    assert any("changed the median step by 34.0 mm" in s for s in sentences(moving))
+    assert not any("come to rest" in s for s in sentences(room[2]))
+
+
 def test_scans_that_stand_still_are_asked_neither() -> None:
     poses = np.tile(np.eye(4), (5, 1, 1))
     scan = ShapedScan(surfaces(1), np.ones((1, 3)))
