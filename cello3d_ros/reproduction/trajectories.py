@@ -18,8 +18,7 @@ from cello3d_ros.reproduction.result import Result
 from cello3d_ros.reproduction.sequences import SEQUENCES
 
 SHOWN = ("wood_summer", "gazebo_winter")  # as in the paper
-_N_DRAWN = 20  # runs
-_N_RUNS = 60  # made, so that enough of them are not lost
+_N_RUNS = 20  # as in the paper
 _N_SIGMA = 2.0
 _MODELS = {"sampled": "sampled", "paper": "paper's model", "relative": "relative model"}
 
@@ -61,7 +60,7 @@ def make(place: Place) -> Result:
     ]
     sentences = [_sentence(key, walk, inside[key]) for key, walk in shown.items()]
     text = (
-        f"Runs of ICP odometry from above, {_N_DRAWN} at most, with ellipses of {_N_SIGMA:g}σ of "
+        f"Runs of ICP odometry from above, {_N_RUNS} at most, with ellipses of {_N_SIGMA:g}σ of "
         f"the compounded covariance at each scan. Sampled covariances and those of the paper's "
         f"model are compounded as independent steps, as in the paper, those of the relative model "
         f"with the bias that neighbouring steps share. Black is the truth, green the end. Errors "
@@ -118,7 +117,7 @@ def _walk(place: Place, found: dict[str, Dataset], key: str) -> _Walk:
         found_way = np.arange(len(runs.paths))
     first = int(found_way[0])
     paths |= {name: of_model.paths[first] for name, of_model in zip(models, every, strict=True)}
-    drawn = [runs.paths[k] for k in found_way[:_N_DRAWN]]
+    drawn = [runs.paths[k] for k in found_way[:_N_RUNS]]
     return _Walk(truth, paths, drawn, int(runs.lost.sum()))
 
 
