@@ -65,21 +65,26 @@ def make(places: Sequence[Place], n_runs: int, source: str) -> Result:
     ]
     if len(places) > 1:
         tables.append(f"D_M by recording:\n\n{markdown_table(_by_recording(places, alone))}")
-    text = (
+    text = "\n\n".join([_text(n_runs, source, len(places)), *tables])
+    title = "Table II: consistency over trajectories"
+    return Result("table2", title, text, data, _csv(rows), _figure(rows))
+
+
+def _text(n_runs: int, source: str, n_places: int) -> str:
+    """Return what the tables mean."""
+    return (
         f"Mean Mahalanobis distance D_M of the final pose of {n_runs} runs of ICP odometry over "
         f"each recording (starts of variance 0.05, covariances compounded to 4th order), "
         f"{source}. A consistent covariance has D_M of {IDEAL_6DOF} in 6 degrees of freedom and "
         f"{IDEAL_3DOF:.2f} in 3; more is optimistic, less is pessimistic. Runs of one recording "
-        f"share the offsets of its registrations from the truth: {len(places)} "
-        f"{'recording is' if len(places) == 1 else 'recordings are'} that many independent "
-        f"samples of a sequence, not {n_runs * len(places)}. *Runs*: those with an answer for "
+        f"share the offsets of its registrations from the truth: {n_places} "
+        f"{'recording is' if n_places == 1 else 'recordings are'} that many independent "
+        f"samples of a sequence, not {n_runs * n_places}. *Runs*: those with an answer for "
         f"every registration, of all. *Lost* ones had a registration end in another minimum; they "
         f"are in all figures, as in the paper. The relative and the "
         f"general model tell lost registrations and cover them (`docs/decisions/0011`); the "
-        f"paper's does not.\n\n" + "\n\n".join(tables)
+        f"paper's does not."
     )
-    title = "Table II: consistency over trajectories"
-    return Result("table2", title, text, data, _csv(rows), _figure(rows))
 
 
 def _data(row: Row) -> dict[str, Any]:
