@@ -30,7 +30,7 @@ SAMPLING = {
     "test": SamplingConfig(n_samples=60, n_views=15, max_gap=2, n_rotations=1),
 }
 N_SCANS = 3
-N_DRIVES = {"train": 15, "test": 6}  # of each world
+N_DRIVES = {"train": 24, "test": 6}  # of each world
 N_WALKS = {"train": 6, "test": 4}  # of each world of the paper's kinds
 WALKED = ("rooms", "hall", "corridor", "stairs", "garden", "wood")
 OF_WALKS = ("spinning16", "spinning32", "spinning64", "wide")

@@ -171,7 +171,6 @@ def test_python_the_command_line_and_replay_answer_alike(
     strange: tuple[Array, Array], recording: InMemory, tmp_path: Path, capsys
 ) -> None:
     r = cello.Estimator()(*strange, T_INIT)
-    assert r.is_unknown  # so that all of them widen it
     for name, points in zip(("reading", "reference"), strange):
         np.save(tmp_path / f"{name}.npy", points)
     np.savetxt(tmp_path / "init.txt", T_INIT)

@@ -18,7 +18,7 @@ from cello3d_ros.geometry.se3 import Array, hat, transform
 from cello3d_ros.registration.overlap import Overlap
 
 _N_NEIGHBORS = 20  # of a normal
-_HELD = 2.0  # least information of a direction against what errors of normals make of it
+HELD = 2.0  # least information of a direction against what errors of normals make of it
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -29,7 +29,9 @@ class ClosedForm(NamedTuple):
     sandwich: ``H^-1 (sum_i g_i g_i^T) H^-1``, what redrawing the reading does to the result to
     first order, g_i being the gradient that one reading point adds; trim_m: the distance up to
     which ICP's rules keep associations; residual_rms_m: root mean square of their point-to-plane
-    residuals; n_associations: how many there are; free: the directions of the sensor that no plane
+    residuals; n_associations: how many there are; normal_variance: mean variance of their normals
+    about either axis of the plane, rad^2; held: least information of a direction against what
+    errors of the normals alone make of it; free: the directions of the sensor that no plane
     holds, names of ``x y z roll pitch yaw``: along them both are too small.
     """
 
@@ -38,6 +40,8 @@ class ClosedForm(NamedTuple):
     trim_m: float
     residual_rms_m: float
     n_associations: int
+    normal_variance: float
+    held: float
     free: tuple[str, ...] = ()
 
 
@@ -56,8 +60,7 @@ def closed_form(
     """
     assert has_shape(reference)
     limit2 = _trim_limit(overlap.distances2, config)
-    weights = np.empty(len(reading.points))
-    H, G, sum2, n = _normal_matrices(
+    H, G, W, sum2, n = _normal_matrices(
         reading.points,
         transform(T_ref_read, reading.points),
         reference.points,
@@ -67,17 +70,19 @@ def closed_form(
         overlap.distances2,
         overlap.indices,
         limit2,
-        weights,
     )
     inverse_H = _inverse(H)
     drawn = _drawn(reading, config)
+    held, free = _held(H, _tilted(W))
     return ClosedForm(
         drawn * inverse_H,
         symmetrized(drawn * inverse_H @ G @ inverse_H),
         np.sqrt(limit2),
         np.sqrt(sum2 / max(n, 1)),
         n,
-        _not_held(H, _tilted(reading.points, weights)),
+        W[3, 3] / max(n, 1),
+        held,
+        free,
     )
 
 
@@ -191,25 +196,25 @@ def _normal_variances(cloud: Cloud) -> Array:
     return np.asarray((1.0 - cloud.planarity / spread) ** 2 / _N_NEIGHBORS)
 
 
-def _tilted(points: Array, weights: Array) -> Array:
+def _tilted(W: Array) -> Array:
     """Return the part of H that errors of the normals alone would make.  (6, 6).
 
-    ``sum w A A^T``, A = [I; hat(p)], w being the variances of the normals at one point.
+    ``sum w A A^T``, A = [I; hat(p)], from ``W = sum w [p; 1] [p; 1]^T``, w being the variances of
+    the normals at one point.
     """
-    W, s = weights.sum(), points.T @ weights
-    S = (points * weights[:, None]).T @ points
     N = np.zeros((6, 6))
-    N[:3, :3] = W * np.eye(3)
-    N[3:, :3], N[:3, 3:] = hat(s), -hat(s)
-    N[3:, 3:] = np.trace(S) * np.eye(3) - S
+    N[:3, :3] = W[3, 3] * np.eye(3)
+    N[3:, :3], N[:3, 3:] = hat(W[:3, 3]), -hat(W[:3, 3])
+    N[3:, 3:] = np.trace(W[:3, :3]) * np.eye(3) - W[:3, :3]
     return N
 
 
-def _not_held(H: Array, N: Array) -> tuple[str, ...]:
-    """Name the directions where H has little more than errors of the normals explain.
+def _held(H: Array, N: Array) -> tuple[float, tuple[str, ...]]:
+    """Return how well the least held direction is held, and the names of those that are free.
 
-    H, N: (6, 6), the normal matrix and the part of it that such errors would make.  A direction v
-    is free where ``v^T H v < _HELD v^T N v``: about ``N / H`` of a motion along it is not seen.
+    H, N: (6, 6), the normal matrix and the part of it that errors of the normals would make.  A
+    direction v is held by ``v^T H v / v^T N v`` and free below HELD: about ``N / H`` of a motion
+    along it is not seen.
     """
     arm = np.sqrt(np.trace(H[3:, 3:]) / max(np.trace(H[:3, :3]), 1e-300))  # radians to metres
     unit = np.array([1.0, 1.0, 1.0, arm, arm, arm]) if arm > 0.0 else np.ones(6)
@@ -218,11 +223,11 @@ def _not_held(H: Array, N: Array) -> tuple[str, ...]:
     least = 1e-12 * np.trace(H + N) + 1e-300
     root = np.linalg.inv(np.linalg.cholesky(N + least * np.eye(6)))
     held, vectors = np.linalg.eigh(root @ H @ root.T)
-    free = held < _HELD
+    free = held < HELD
     if not free.any():
-        return ()
+        return float(held[0]), ()
     directions, _ = np.linalg.qr(root.T @ vectors[:, free])
-    return _named(directions)
+    return float(held[0]), _named(directions)
 
 
 def free_error(directions: tuple[str, ...]) -> FreeDirectionError:
@@ -248,23 +253,21 @@ def _normal_matrices(
     distances2: Array,
     indices: Indices,
     limit: float,
-    weights: Array,
-) -> tuple[Array, Array, float, int]:
-    """Return H = sum J^T J and G = sum_i g_i g_i^T, g_i = sum J^T r over one point's neighbours.
+) -> tuple[Array, Array, Array, float, int]:
+    """Return H = sum J^T J, G = sum_i g_i g_i^T and W = sum_i w_i [p_i; 1] [p_i; 1]^T.
 
-    The third is sum r^2, the fourth how many associations all of these are sums of.  weights is
-    filled with the sum of the normals' variances at each reading point.
+    Over one point's neighbours g_i is the sum of J^T r, w_i that of the normals' variances.  The
+    fourth is sum r^2, the fifth how many associations all of these are sums of.
 
     The residual of ``T exp(xi) p`` has the Jacobian ``[m, p x m]``, m = R^T n: the reading side.
     All of one point's are ``A m`` with the same ``A = [I; hat(p)]``, so that it adds
     ``A M A^T`` to H, M = sum m m^T, and ``g = A sum m r``.
     """
-    H, G = np.zeros((6, 6)), np.zeros((6, 6))
-    M, B, g = np.empty((3, 3)), np.empty((3, 3)), np.empty(6)
+    H, G, W = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((4, 4))
+    M, B, g, p = np.empty((3, 3)), np.empty((3, 3)), np.empty(6), np.ones(4)
     sum2, n = 0.0, 0
     for i in range(len(moved)):
-        xx = yy = zz = xy = xz = yz = a = b = c = 0.0
-        weights[i] = 0.0
+        xx = yy = zz = xy = xz = yz = a = b = c = w = 0.0
         for j in range(indices.shape[1]):
             if not distances2[i, j] <= limit:
                 break
@@ -277,7 +280,7 @@ def _normal_matrices(
                 continue
             sum2 += r * r
             n += 1
-            weights[i] += variances[q]
+            w += variances[q]
             x = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
             y = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
             z = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz
@@ -290,6 +293,10 @@ def _normal_matrices(
         M[1, 0], M[1, 1], M[1, 2] = xy, yy, yz
         M[2, 0], M[2, 1], M[2, 2] = xz, yz, zz
         x, y, z = reading[i, 0], reading[i, 1], reading[i, 2]
+        p[0], p[1], p[2] = x, y, z
+        for u in range(4):
+            for v in range(4):
+                W[u, v] += w * p[u] * p[v]
         for u in range(3):  # hat(p) M, M being symmetric: row by row its transpose
             B[u, 0] = y * M[u, 2] - z * M[u, 1]
             B[u, 1] = z * M[u, 0] - x * M[u, 2]
@@ -309,4 +316,4 @@ def _normal_matrices(
     for u in range(6):
         for v in range(u):
             H[v, u], G[v, u] = H[u, v], G[u, v]
-    return H, G, sum2, n
+    return H, G, W, sum2, n

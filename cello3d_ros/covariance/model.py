@@ -50,7 +50,7 @@ CONVENTIONS = {
     "relative": "S^-1/2 Y S^-1/2, symmetric root",
     "weight": "exp(-|Theta (d - d_k)|^2)",
 }
-SHIPPED = ("general", "structured", "semi_structured", "unstructured", "paper")
+SHIPPED = ("general", "paper")
 SHAPES = ("none", "hessian", "sandwich")
 
 _MAX_HEADER_BYTES = 16 * 1024**2

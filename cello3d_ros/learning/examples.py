@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.config import Pipeline, SamplingConfig, differences, pipeline_name
-from cello3d_ros.covariance.features import model_inputs
+from cello3d_ros.covariance.features import is_free, model_inputs
 from cello3d_ros.covariance.heading import blended, into_motion, motion_of, out_of_motion
 from cello3d_ros.covariance.model import Model, Prediction, predict
 from cello3d_ros.errors import DatasetError
@@ -76,10 +76,12 @@ def load_examples(datasets: Sequence[Dataset], recordings: Iterable[str]) -> Exa
                 if key in records:
                     raise DatasetError(f"{dataset.path} repeats the pair {key} of another dataset")
                 records[key] = _slim(record := dataset.read(*key))
-                if record.accepted:
+                if record.accepted and not is_free(record.features).any():
                     lost[key] = _lost(record, dataset.sampling)
     found = _stacked([records[key] for key in sorted(records)], datasets[0])
-    return dataclasses.replace(found, lost_xi=np.concatenate([lost[key] for key in sorted(lost)]))
+    return dataclasses.replace(
+        found, lost_xi=np.concatenate([np.zeros((0, 6)), *(lost[key] for key in sorted(lost))])
+    )
 
 
 def select_inputs(examples: Examples, kind: str) -> Examples:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from cello3d_ros.config import TrainingConfig
+from cello3d_ros.covariance.features import is_free
 from cello3d_ros.covariance.heading import mean_of_turns
 from cello3d_ros.covariance.lost import Lost, spread_m
 from cello3d_ros.covariance.model import Model, project
@@ -43,7 +44,7 @@ from cello3d_ros.learning.loss import (
     select_targets,
     validation_problem,
 )
-from cello3d_ros.learning.measures import Figures, evaluate
+from cello3d_ros.learning.measures import Figures, evaluate, select
 
 Progress = Callable[[int, float, float], None]  # iteration, training loss, what Theta is judged by
 
@@ -85,9 +86,9 @@ def fit(
     Theta = 0, the mean of the examples, takes part.  Deterministic; an interrupt (Ctrl-C) ends
     training with the best so far.  Raises DatasetError for fewer than two recordings.
     """
-    examples = select_inputs(examples, config.features)
+    examples = _held(select_inputs(examples, config.features))
     if validation is not None:
-        validation = select_inputs(validation, config.features)
+        validation = _held(select_inputs(validation, config.features))
     _check_groups(examples, validation)
     mean, scale, active = _scaler(examples, config)
     problem = leave_out_problem(examples, config, mean, scale)
@@ -324,6 +325,13 @@ class _Search:
 
 class _Stop(Exception):
     """Ends the optimiser from its callback."""
+
+
+def _held(examples: Examples) -> Examples:
+    """Return the pairs without a free direction: one has no size to learn, and no answer."""
+    if not len(examples.global_features):
+        return examples
+    return select(examples, ~is_free(examples.global_features))
 
 
 def _check_groups(examples: Examples, validation: Examples | None) -> None:

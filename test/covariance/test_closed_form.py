@@ -33,8 +33,8 @@ def normal_matrix(points, normals):
     """Return H for points that are associated with themselves."""
     n = len(points)
     zeros, own = np.zeros((n, 1)), np.arange(n)[:, None]
-    H, G, _, _ = _normal_matrices(
-        points, points, points, normals, np.zeros(n), np.eye(3), zeros, own, 1.0, np.empty(n)
+    H, G, _, _, _ = _normal_matrices(
+        points, points, points, normals, np.zeros(n), np.eye(3), zeros, own, 1.0
     )
     np.testing.assert_array_equal(G, 0.0)  # no residuals
     return H
@@ -199,7 +199,8 @@ def test_what_errors_of_normals_alone_make_of_h_is_their_mean():
     rng = np.random.default_rng(37)
     Q, normals = join(*(plane(rng, axis, 2.0, 200) for axis in (1, 2)))
     sigma = 0.02
-    N = _tilted(Q, np.full(len(Q), sigma**2))
+    homogeneous = np.column_stack([Q, np.ones(len(Q))])
+    N = _tilted(sigma**2 * homogeneous.T @ homogeneous)
     found = [
         normal_matrix(Q, normals + sigma * rng.normal(size=normals.shape)) for _ in range(300)
     ]

@@ -7,7 +7,7 @@ from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import CloudConfig, IcpConfig, Pipeline
 from cello3d_ros.covariance.description import describe, turns
 from cello3d_ros.covariance.features import FEATURES, model_inputs
-from cello3d_ros.geometry.se3 import exp, inverse, transform
+from cello3d_ros.geometry.se3 import exp, hat, inverse, transform
 
 T_HAT = exp([0.4, -0.3, 0.05, 0.02, 0.05, 0.6])
 
@@ -24,6 +24,26 @@ def by_name(description):
     return dict(zip(FEATURES, description.features, strict=True))
 
 
+def rms(vectors):
+    return np.sqrt(np.mean(np.sum(vectors**2, axis=1)))
+
+
+def normal_variances(cloud):
+    spread = 1.0 - cloud.cylindricality
+    return (1.0 - cloud.planarity / spread) ** 2 / 20
+
+
+def found_held(reading, reference, T, idx, kept):
+    """Least eigenvalue of H against N, association by association."""
+    H, N = np.zeros((6, 6)), np.zeros((6, 6))
+    variances = normal_variances(reference)
+    for i, j in zip(*np.nonzero(kept)):
+        A = np.vstack([np.eye(3), hat(reading.points[i])])
+        m = A @ T[:3, :3].T @ reference.normals[idx[i, j]]
+        H, N = H + np.outer(m, m), N + variances[idx[i, j]] * A @ A.T
+    return np.linalg.eigvals(np.linalg.solve(N, H)).real.min()
+
+
 def test_each_feature_is_what_it_is_called(pair):
     reading, reference = pair
     icp = IcpConfig(n_reading_points=500, n_reference_points=10**6)
@@ -38,6 +58,7 @@ def test_each_feature_is_what_it_is_called(pair):
     diagonal = np.diag(H_inverse)
     unit = np.sqrt(np.repeat([diagonal[:3].mean(), diagonal[3:].mean()], 3))
     against = np.log(np.linalg.eigvals(np.linalg.solve(H_inverse, S)).real / np.mean(r**2))
+    moved = transform(T_HAT, reading.points) - reading.points
     expected = {
         "overlap_ratio": found.overlap_ratio,
         "log_sandwich_m": 0.5 * np.log(np.trace(S[:3, :3])),
@@ -51,7 +72,10 @@ def test_each_feature_is_what_it_is_called(pair):
         "log_associations": np.log(kept.sum()),
         "log_reading_points_per_draw": np.log(len(reading.points) / 500),
         "log_reference_points_per_draw": 0.0,
-        "log_motion_m": np.log(0.1 + np.linalg.norm(T_HAT[:3, 3])),
+        "log_displacement_m": np.log(5e-4 + rms(moved)),
+        "log_range_m": np.log(rms(reading.points)),
+        "log_normal_variance": np.log(normal_variances(reference)[idx][kept].mean()),
+        "log_held": np.log(found_held(reading, reference, T_HAT, idx, kept)),
     }
     assert set(expected) == set(FEATURES)
     for name, value in expected.items():

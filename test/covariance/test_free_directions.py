@@ -45,10 +45,27 @@ def test_what_no_plane_holds_is_named_and_has_no_answer(estimator, hit, free, n_
             step(estimator, hit, n_beams, seed)
 
 
+START = STEP @ exp([0.1, -0.1, 0.02, 0.0, 0.01, 0.03])
+
+
 @pytest.mark.parametrize("n_beams", BEAMS)
-@pytest.mark.parametrize("size", [(12.0, 9.0, 1.2), (30.0, 2.0, 1.2)], ids=["room", "corridor"])
-def test_walls_on_all_sides_have_an_answer(estimator, size, n_beams):
+def test_walls_on_all_sides_have_an_answer(estimator, n_beams):
     for seed in range(3):
-        start = STEP @ exp([0.1, -0.1, 0.02, 0.0, 0.01, 0.03])
-        found = step(estimator, to_box(*size), n_beams, seed, start)
+        found = step(estimator, to_box(12.0, 9.0, 1.2), n_beams, seed, START)
         assert np.linalg.norm(log(inverse(STEP) @ found.registration.T_ref_read)) < 0.05
+
+
+@pytest.mark.parametrize("n_beams", BEAMS)
+def test_a_corridor_of_60_m_is_answered_within_its_covariance_or_its_length_is_free(
+    estimator, n_beams
+):
+    """Few beams meet the walls at its ends: ICP then errs by decimetres along it."""
+    for seed in range(3):
+        try:
+            found = step(estimator, to_box(30.0, 2.0, 1.2), n_beams, seed, START)
+        except FreeDirectionError as error:
+            if "holds x of the sensor" in str(error):
+                continue
+            raise
+        xi = log(inverse(STEP) @ found.registration.T_ref_read)
+        assert xi @ np.linalg.solve(found.covariance, xi) < 22.46  # .999 of 6 degrees of freedom

@@ -673,13 +673,14 @@ def test_a_shipped_model_is_small_and_says_what_it_was_made_of(name: str) -> Non
     model = load_model(path)
     assert model.features == "global"
     assert model.n_features == len(FEATURES)
-    assert pipeline_name(model.pipeline) in ("paper, changed", "robot")
+    assert model.frame == "motion"
+    assert pipeline_name(model.pipeline) in ("robot", "robot, changed")
     assert is_positive_definite(model.training_mean)
     assert model.input_range.shape == (2, len(FEATURES))
-    tested = {"11", "12", "13", "14"}  # seeds of which docs/evaluation.md has the figures
-    seen = {**model.provenance["recordings"], **model.provenance["validation_recordings"]}
-    assert seen
-    assert not tested & {recording.rsplit("_s", 1)[1] for recording in seen}
+    seen = model.provenance["recordings"]
+    seeds = [int(name.rsplit("-", 1)[1]) for name in seen if name.count("-") == 3]
+    assert len(seeds) > 200
+    assert max(seeds) < 5000  # from there on they are for the figures of docs/evaluation.md
 
 
 def test_the_papers_model_has_its_form_and_was_trained_on_its_seven_sequences() -> None:

@@ -19,7 +19,7 @@ def test_novelty_is_beyond_a_quantile_where_the_distance_is_beyond_that_of_the_m
     for size in np.geomspace(1e-4, 30.0, 120):
         away = example + size * rng.normal(size=model.n_features)
         inputs = model.mean + model.scale * away
-        found = predict(model, inputs, np.eye(6))
+        found = predict(model, inputs, np.eye(6), [1.0, 0.0])
         assert (found.novelty > quantile) == (found.nearest_rho > limit)
         verdicts.append(found.novelty > quantile)
     assert any(verdicts)
@@ -29,7 +29,7 @@ def test_novelty_is_beyond_a_quantile_where_the_distance_is_beyond_that_of_the_m
 def test_nothing_is_beyond_the_quantile_1() -> None:
     model = load_model(find_model("general"))
     far = model.mean + 1e4 * model.scale
-    assert predict(model, far, np.eye(6)).novelty == 1.0
+    assert predict(model, far, np.eye(6), [1.0, 0.0]).novelty == 1.0
 
 
 def test_a_model_that_keeps_no_quantiles_calls_nothing_novel() -> None:

@@ -101,7 +101,8 @@ def test_pairs_join_the_examples_where_the_model_has_a_wrong_shape(
 ) -> None:
     monkeypatch.setattr(tuning, "_FEWEST_FOR_EXAMPLES", 12)
     D = np.diag([30.0, 1.0, 1.0, 1.0, 1.0, 30.0])
-    crooked = replace(general, covariances=D @ general.covariances @ D)
+    few = general.projections[::1000], general.covariances[::1000]  # that a dozen pairs outweigh
+    crooked = replace(general, projections=few[0], covariances=D @ few[1] @ D)
     found = tune(crooked, dataset)
     n_new = len(found.model.covariances) - len(crooked.covariances)
     assert found.kind == EXAMPLES

@@ -115,12 +115,12 @@ def test_the_node_takes_the_shipped_parameter_file(tmp_path, domain_id, model_pa
 
 
 def test_a_shipped_model_has_a_name(tmp_path, domain_id) -> None:
-    with NodeProcess(tmp_path / "log", domain_id, {"node.model": "unstructured"}) as process:
+    with NodeProcess(tmp_path / "log", domain_id, {"node.model": "paper"}) as process:
         player = Player(domain_id, check=process.check)
         running = player.spin_until(lambda: bool(player.replay.last_status), 60.0)
         player.close()
         assert running
-        assert player.replay.last_status["model"] == "unstructured.npz"
+        assert player.replay.last_status["model"] == "paper.npz"
         assert process.stop() == 0
 
 
