@@ -195,7 +195,7 @@ def select(examples: Examples, keep: NDArray[np.bool_]) -> Examples:
         covariances=examples.covariances[keep],
         groups=examples.groups[keep],
         shapes={name: S[keep] for name, S in examples.shapes.items()},
-        xi=tuple(xi for xi, kept in zip(examples.xi, keep, strict=True) if kept),
+        xi=tuple(examples.xi[k] for k in np.flatnonzero(keep)) if examples.xi else (),
     )
 
 

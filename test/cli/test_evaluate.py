@@ -48,7 +48,7 @@ def record(name: str, i: int, offset_m: float = 0.0, n_features: int = 704) -> P
         kept=np.ones(60, np.bool_),
         covariance=Y,
         descriptors=rng.random((1, n_features), dtype=np.float32),
-        features=rng.normal(size=len(FEATURES)),
+        features=rng.normal(5.0, size=len(FEATURES)),
         rotations_rad=np.zeros(1),
         shapes={"sandwich": Y / 4.0, "hessian": Y * 100.0},
     )

@@ -49,7 +49,7 @@ def fill(path: Path, names: list[str], seed: int = 0, **settings: object) -> Pat
                     kept=np.ones(40, np.bool_),
                     covariance=xi.T @ xi / 39,
                     descriptors=rng.random((2, 22), dtype=np.float32),
-                    features=rng.normal(size=len(FEATURES)),
+                    features=rng.normal(5.0, size=len(FEATURES)),
                     rotations_rad=np.array([0.0, np.pi / 2]),
                     shapes={"sandwich": np.eye(6) * 1e-4, "hessian": np.eye(6) * 1e-6},
                 )

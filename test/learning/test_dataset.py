@@ -32,7 +32,7 @@ def accepted(recording: str = "hall", i: int = 0, j: int = 1, seed: int = 0) -> 
         n_failed=1,
         covariance=Y,
         descriptors=rng.random((4, 704), dtype=np.float32),
-        features=rng.normal(size=len(FEATURES)),
+        features=rng.normal(5.0, size=len(FEATURES)),
         rotations_rad=np.arange(4) * np.pi / 2,
         shapes={"hessian": np.eye(6), "sandwich": 2 * Y},
         overlap_ratio=0.8,

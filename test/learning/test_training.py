@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cello3d_ros.config import CloudConfig, Pipeline, SamplingConfig, TrainingConfig
+from cello3d_ros.covariance.closed_form import HELD
 from cello3d_ros.covariance.features import FEATURES
 from cello3d_ros.covariance.model import predict
 from cello3d_ros.errors import ConfigError, DatasetError
@@ -25,6 +26,7 @@ from cello3d_ros.learning.loss import (
 )
 from cello3d_ros.learning.training import fit, known_lost
 
+N_MORE = len(FEATURES) - 10  # global features beside the planted ones
 PAPER = TrainingConfig(
     features="descriptor",
     shape="none",
@@ -490,7 +492,7 @@ def filled(path: Path, names: tuple[str, ...], **settings: object) -> Dataset:
                     kept=np.arange(500) < 450,
                     covariance=covariances(1, rng)[0],
                     descriptors=rng.random((2, 11), dtype=np.float32),
-                    features=rng.normal(size=len(FEATURES)),
+                    features=rng.normal(5.0, size=len(FEATURES)),
                     rotations_rad=np.array([0.0, np.pi / 2]),
                     shapes={"sandwich": covariances(1, rng)[0]},
                 )
@@ -590,6 +592,18 @@ def test_no_accepted_pair_is_said(tmp_path: Path) -> None:
         load_examples([filled(tmp_path / "one", ("a",))], ["nobody"])
 
 
+def test_a_pair_with_a_free_direction_is_no_example() -> None:
+    examples = planted(120)
+    held = np.random.default_rng(4).uniform(1.0, 4.0, 120)
+    features = np.column_stack([examples.features[:, 0], np.full((120, N_MORE - 1), 5.0)])
+    examples = dataclasses.replace(
+        examples, global_features=np.column_stack([features, np.log(held)])
+    )
+    model = fit(examples, dataclasses.replace(PAPER, features="global", max_iterations=2)).model
+    assert model.n_examples == (held >= HELD).sum()
+    assert model.n_examples < 120
+
+
 def test_global_features_are_learned_from_without_turned_copies() -> None:
     """Planted: Y depends on one global feature; the descriptor is noise."""
     examples = planted(120)
@@ -597,7 +611,9 @@ def test_global_features_are_learned_from_without_turned_copies() -> None:
     with_both = dataclasses.replace(
         examples,
         features=noise.astype(np.float32),
-        global_features=examples.features[:, 0].astype(np.float64),
+        global_features=np.column_stack(
+            [examples.features[:, 0].astype(np.float64), np.full((120, N_MORE), 5.0)]
+        ),
         rotations_rad=np.array([0.0, 1.0]),
     )
     config = dataclasses.replace(PAPER, features="global", max_iterations=20)
@@ -605,9 +621,9 @@ def test_global_features_are_learned_from_without_turned_copies() -> None:
     plain = fit(examples, dataclasses.replace(config, features="descriptor")).model
     assert model.features == "global"
     assert model.n_examples == 120
-    np.testing.assert_allclose(model.theta, plain.theta, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(model.theta[:, :-N_MORE], plain.theta, rtol=1e-4, atol=1e-6)
     both = fit(with_both, dataclasses.replace(config, features="both")).model
-    assert both.n_features == plain.n_features + 4
+    assert both.n_features == len(FEATURES) + 4
     seen = with_both.global_features
     np.testing.assert_array_equal(model.input_range, [seen.min(axis=0), seen.max(axis=0)])
     assert len(plain.input_range) == 0
