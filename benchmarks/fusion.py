@@ -139,7 +139,10 @@ class Remembered(Simulation):
     def __iter__(self) -> Iterator[Scan]:
         def made() -> list[Scan]:
             scans = super(Remembered, self).__iter__()
-            return [replace(s, points=s.points.astype(np.float32), echoes=None) for s in scans]
+            return [
+                replace(s, points=s.points.astype(np.float32), echoes=None, look=None)
+                for s in scans
+            ]
 
         self.folder.mkdir(exist_ok=True)
         for scan in kept(self.folder / f"{self.name}-{self.n_scans}.pickle", made):
