@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cello3d_ros.covariance.case import MethodSettings
-from cello3d_ros.covariance.features import is_free
 from cello3d_ros.covariance.methods import METHODS, extra_runs, mean_example
 from cello3d_ros.covariance.model import Model, placed
 from cello3d_ros.errors import DatasetError
@@ -92,7 +91,6 @@ def from_dataset(
 
     mean: (6, 6), the baseline.  ``cello3d_widened`` is what the node makes of the model's answer
     by default: the larger of it and the mean of the examples beyond ``settings.unknown_quantile``.
-    Both are NaN where a direction is free: the node has no answer.
     Raises DatasetError where the dataset's settings are not the model's: its descriptors would not
     be comparable.
     """
@@ -114,9 +112,6 @@ def from_dataset(
     for k, answer in enumerate(found):
         if answer.novelty > settings.unknown_quantile:
             covariances["cello3d_widened"][k] = larger(constant[k], answer.covariance)
-    if len(examples.global_features):
-        for name in ("cello3d", "cello3d_widened"):
-            covariances[name][is_free(examples.global_features)] = np.nan
     if "hessian" in examples.shapes:
         covariances["hessian"] = settings.sigma_m**2 * examples.shapes["hessian"]
     if "sandwich" in examples.shapes:

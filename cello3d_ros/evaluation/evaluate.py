@@ -32,9 +32,9 @@ from cello3d_ros.evaluation.trajectories import consistency, length_m, odometry_
 from cello3d_ros.learning.align_sweeps import AlignSettings
 from cello3d_ros.learning.aligned import aligned_parts, joint_folder
 from cello3d_ros.learning.dataset import UNDONE, Dataset, open_dataset
-from cello3d_ros.learning.examples import Examples, load_examples
+from cello3d_ros.learning.examples import Examples, are_held, load_examples
 from cello3d_ros.learning.identity import prints_of
-from cello3d_ros.learning.measures import pose_check
+from cello3d_ros.learning.measures import pose_check, select
 from cello3d_ros.recordings import Recording, open_recording
 from cello3d_ros.recordings.deskew import without_motion
 
@@ -108,13 +108,11 @@ def evaluate(
     recordings = _recordings(settings.recordings, names, opened)
     baseline = [open_dataset(folder) for folder in settings.baseline]
     mean = mean_of(baseline) if baseline else training_mean(loaded)
-    examples = load_examples(opened, names)
+    examples, keys = _answered(opened, names)
     methods = MethodSettings(
         settings.sensor_sigma_m, settings.n_registrations, widen_unknown=False
     )
-    judged = _Judged(
-        opened, _accepted(opened, names), examples, from_dataset(loaded, examples, mean, methods)
-    )
+    judged = _Judged(opened, keys, examples, from_dataset(loaded, examples, mean, methods))
     for recording in recordings:
         _add_online(judged, recording, loaded, methods, settings, progress)
     found = _judge(judged, methods, settings.exact_poses, seen)
@@ -186,15 +184,19 @@ def _recordings(
     return list(found.values())
 
 
-def _accepted(datasets: Sequence[Dataset], names: Sequence[str]) -> list[Key]:
-    """Return the accepted pairs, in the order of the examples."""
-    wanted = set(names)
-    return sorted(
+def _answered(datasets: Sequence[Dataset], names: Sequence[str]) -> tuple[Examples, list[Key]]:
+    """Return the accepted pairs without a free direction, which has no answer, and their keys."""
+    examples, wanted = load_examples(datasets, names), set(names)
+    keys = sorted(
         key
         for dataset in datasets
         for key in dataset.pair_keys()
         if key[0] in wanted and dataset.read(*key).accepted
     )
+    kept = are_held(examples)
+    if not kept.any():
+        raise DatasetError(f"{datasets[0].path}: in every pair no plane holds some direction")
+    return select(examples, kept), [key for key, keep in zip(keys, kept, strict=True) if keep]
 
 
 def _add_online(

@@ -96,6 +96,13 @@ def select_inputs(examples: Examples, kind: str) -> Examples:
     return dataclasses.replace(examples, features=inputs, rotations_rad=np.zeros(1))
 
 
+def are_held(examples: Examples) -> NDArray[np.bool_]:
+    """Return which pairs have no free direction: others have no answer, and no size to learn."""
+    if not len(examples.global_features):
+        return np.ones(len(examples.covariances), np.bool_)
+    return ~is_free(examples.global_features)
+
+
 def to_relative(examples: Examples, shape: str) -> Array:
     """Return ``S^-1/2 Y S^-1/2`` of every pair, or Y if the shape is none."""
     if shape == "none":

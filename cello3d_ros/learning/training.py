@@ -15,18 +15,18 @@ import numpy as np
 from scipy.optimize import minimize
 
 from cello3d_ros.config import TrainingConfig
-from cello3d_ros.covariance.features import is_free
 from cello3d_ros.covariance.heading import mean_of_turns
 from cello3d_ros.covariance.lost import Lost, spread_m
 from cello3d_ros.covariance.model import Model, project
 from cello3d_ros.covariance.sums import unpack
-from cello3d_ros.errors import ConfigError, DatasetError
+from cello3d_ros.errors import ConfigError, DatasetError, FreeDirectionError
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.dataset import package_versions
 from cello3d_ros.learning.examples import (
     Examples,
     Indices,
+    are_held,
     feature_scaler,
     flat_features,
     select_inputs,
@@ -86,9 +86,9 @@ def fit(
     Theta = 0, the mean of the examples, takes part.  Deterministic; an interrupt (Ctrl-C) ends
     training with the best so far.  Raises DatasetError for fewer than two recordings.
     """
-    examples = _held(select_inputs(examples, config.features))
+    examples = _inputs(examples, config.features)
     if validation is not None:
-        validation = _held(select_inputs(validation, config.features))
+        validation = _inputs(validation, config.features)
     _check_groups(examples, validation)
     mean, scale, active = _scaler(examples, config)
     problem = leave_out_problem(examples, config, mean, scale)
@@ -327,11 +327,13 @@ class _Stop(Exception):
     """Ends the optimiser from its callback."""
 
 
-def _held(examples: Examples) -> Examples:
-    """Return the pairs without a free direction: one has no size to learn, and no answer."""
-    if not len(examples.global_features):
+def _inputs(examples: Examples, kind: str) -> Examples:
+    """Return what a model of ``kind`` is trained on; the paper's descriptor knows of no held."""
+    examples = select_inputs(examples, kind)
+    if kind == "descriptor" or (held := are_held(examples)).all():
         return examples
-    return select(examples, ~is_free(examples.global_features))
+    rejected = {**examples.rejected, FreeDirectionError.reason: int((~held).sum())}
+    return dataclasses.replace(select(examples, held), rejected=rejected)
 
 
 def _check_groups(examples: Examples, validation: Examples | None) -> None:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cello3d_ros.covariance.features import is_free
 from cello3d_ros.covariance.model import Model, project
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.geometry.gaussian import kl
@@ -19,6 +18,7 @@ from cello3d_ros.learning.dataset import Dataset
 from cello3d_ros.learning.examples import (
     Examples,
     answers,
+    are_held,
     check_settings,
     examples_of,
     flat_features,
@@ -69,9 +69,8 @@ def tune(model: Model, dataset: Dataset) -> Tuning:
     found = dataset.pair_keys()
     rejected, keys = _split(found, np.array([not dataset.read(*key).accepted for key in found]))
     examples = select_inputs(load_examples([dataset], {key[0] for key in keys}), model.features)
-    if len(examples.global_features):
-        free, keys = _split(keys, is_free(examples.global_features))
-        rejected, examples = rejected + free, select(examples, ~is_free(examples.global_features))
+    free, keys = _split(keys, ~are_held(examples))
+    rejected, examples = rejected + free, select(examples, are_held(examples))
     _check(model, examples, len(keys))
     agrees = np.array([not pose_check(xi).flagged for xi in examples.xi], np.bool_)
     flagged, keys = _split(keys, ~agrees)

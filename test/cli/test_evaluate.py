@@ -124,6 +124,24 @@ def test_figures_are_written_and_printed(folder: Path, capsys: pytest.CaptureFix
     assert sorted(path.name for path in folder.iterdir()) == ["e.json", "model.npz", "set"]
 
 
+def test_pairs_with_a_free_direction_have_no_answer_to_judge(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset = open_dataset(folder / "set")
+    for i in range(3):
+        tunnel = record("tunnel", i)
+        tunnel.features[FEATURES.index("log_held")] = 0.0 if i else 5.0
+        dataset.write(tunnel)
+    assert evaluate(folder, "--only", "tunnel", "--json", folder / "e.json") == 0
+    assert json.loads((folder / "e.json").read_text())["n_pairs"] == 1
+    capsys.readouterr()
+    tunnel = record("cave", 0)
+    tunnel.features[FEATURES.index("log_held")] = 0.0
+    dataset.write(tunnel)
+    assert evaluate(folder, "--only", "cave") == 1
+    assert "in every pair no plane holds some direction" in complaint(capsys)
+
+
 def test_what_a_report_draws_is_written(folder: Path, walk: Path) -> None:
     words = ("--only", "walk", "--recordings", walk, "--registrations", 10, "--jobs", 1)
     out = ("--trajectories", 3, "--json", folder / "e.json")
