@@ -98,7 +98,7 @@ class Alignment:
     @property
     def rests(self) -> bool:
         """Whether the last sweep hardly changed the steps."""
-        return not self.moves_m or self.moves_m[-1] < _TOLERANCE_M
+        return not self.moves_m or self.moves_m[-1] < 2.0 * _TOLERANCE_M
 
     @property
     def n_parts(self) -> int:
