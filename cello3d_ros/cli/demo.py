@@ -301,7 +301,7 @@ def _replay(
     given = [word for text in parameters for word in ("-p", text)]
     if arguments.model:
         given += ["-p", f"node.model:={find_model(arguments.model).resolve()}"]
-    print("Starting covariance_node; its first start compiles for about a minute.", flush=True)
+    print("Starting covariance_node; its first start compiles for half a minute.", flush=True)
     with (
         NodeProcess(arguments.out / "node.log", domain_id, ros_arguments=given) as node,
         _bar(len(recording)) as bar,
