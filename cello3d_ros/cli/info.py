@@ -17,6 +17,8 @@ from cello3d_ros.config import PIPELINE, config_to, pipeline_name
 from cello3d_ros.covariance.model import FORMAT_VERSION, SHIPPED, Model, find_model, load_model
 from cello3d_ros.errors import Cello3dError
 
+_MOST_ROWS = 20  # of a table of recordings
+
 
 class Kind(NamedTuple):
     """One kind of file: which paths are of it, and what is known of one, as nested mappings."""
@@ -39,7 +41,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print(json.dumps(description, indent=2))
     else:
-        print("\n".join(table(without_prints(description))))
+        print("\n".join(table(abridged(description))))
 
 
 def describe(path: Path, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -55,13 +57,16 @@ def describe(path: Path, arguments: argparse.Namespace) -> dict[str, Any]:
     raise Cello3dError(f"{path} is not a {names}")
 
 
-def without_prints(description: dict[str, Any]) -> dict[str, Any]:
-    """Return the description with a count in place of the fingerprints that a model keeps."""
-    provenance = description.get("provenance", {})
-    if not (prints := provenance.get("prints")):
-        return description
-    count = f"of {len(prints)} recordings (--json shows them)"
-    return {**description, "provenance": {**provenance, "prints": count}}
+def abridged(description: dict[str, Any]) -> dict[str, Any]:
+    """Return the description with counts in place of the long lists that a model keeps."""
+    provenance = dict(description.get("provenance", {}))
+    for name, found in provenance.items():
+        if not isinstance(found, dict) or len(found) <= _MOST_ROWS:
+            continue
+        counts = [n for n in found.values() if isinstance(n, int)]
+        of = f"{sum(counts)} pairs of " if len(counts) == len(found) else "of "
+        provenance[name] = f"{of}{len(found)} recordings (--json lists them)"
+    return {**description, "provenance": provenance} if provenance else description
 
 
 def table(description: dict[str, Any]) -> Iterator[str]:

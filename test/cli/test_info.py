@@ -73,15 +73,18 @@ def test_json_holds_the_same_for_a_machine(
     assert "mean_sigmas_m" not in found
 
 
-def test_a_table_counts_the_fingerprints_that_json_lists(
+def test_a_table_counts_the_recordings_that_json_lists(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     info.run(parsed("general"))
     lines = capsys.readouterr().out.splitlines()
-    (row,) = (line.split(maxsplit=1) for line in lines if line.strip().startswith("prints"))
+    rows = dict(line.split(maxsplit=1) for line in lines if "--json" in line)
     info.run(parsed("general", "--json"))
-    prints = json.loads(capsys.readouterr().out)["provenance"]["prints"]
-    assert row[1] == f"of {len(prints)} recordings (--json shows them)"
+    provenance = json.loads(capsys.readouterr().out)["provenance"]
+    n, n_pairs = len(provenance["recordings"]), sum(provenance["recordings"].values())
+    assert rows["recordings"] == f"{n_pairs} pairs of {n} recordings (--json lists them)"
+    assert rows["prints"] == f"of {len(provenance['prints'])} recordings (--json lists them)"
+    assert len(lines) < 200
 
 
 def test_a_path_of_no_known_kind_is_an_error_that_names_the_kinds(tmp_path: Path) -> None:
