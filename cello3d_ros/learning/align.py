@@ -334,7 +334,7 @@ def _sweep(
         state.is_last = rests or state.sweep == MAX_SWEEPS
         _save(folder, key, state)
     _register_pairs(state, store, settings)
-    _look_at_scans(state, store, settings.seed)
+    _look_at_scans(state, store, settings)
     state.is_done = True
     _save(folder, key, state)
     store.clear()
@@ -397,18 +397,25 @@ def _register_pairs(state: _State, store: ScanStore, settings: AlignSettings) ->
             state.pairs[j] = log(inverse(T) @ found.T_ref_read)
 
 
-def _look_at_scans(state: _State, store: ScanStore, seed: int) -> None:
-    """Find what may be wrong with the scans of the longest part: smeared, or with the vehicle."""
+def _look_at_scans(state: _State, store: ScanStore, settings: AlignSettings) -> None:
+    """Find what may be wrong with the scans of the longest part: smeared, or with the vehicle.
+
+    A vehicle has normals only in a single scan: those of all scans together are blurred by it.
+    """
     poses = state.chain.poses
     members = np.flatnonzero((state.chain.part == 0) & state.held)
 
     def shaped(k: int) -> ShapedScan:
         return store.shaped(k, state.sweep)
 
+    def alone(k: int) -> ShapedScan:
+        cloud = with_shape(cloud_of(shaped(k).points), settings.pipeline.cloud)
+        return ShapedScan(cloud.points, cloud.normals)
+
     if len(members) >= 3:
-        state.carried = carried_of(poses, members, shaped)
+        state.carried = carried_of(poses, members, alone)
         if not state.compensated:
-            state.smear = smear_of(poses, members, shaped, seed)
+            state.smear = smear_of(poses, members, shaped, settings.seed)
 
 
 def _finished(name: str, state: _State) -> Alignment:

@@ -39,7 +39,7 @@ def carried_of(
 ) -> Carried | None:
     """Compare scans half a metre apart; None where no two are.
 
-    poses: (n, 4, 4), of the members at least.  shaped: gives a scan with its normals.
+    poses: (n, 4, 4), of the members at least.  shaped: gives a scan with its own normals.
     """
     shares, ranges = [], []
     for i in members[:: max(1, len(members) // _N_PAIRS)].tolist():
@@ -64,6 +64,6 @@ def _stays(points: Array, T: Array, other: ShapedScan) -> NDArray[np.bool_]:
     same = nearest(tree, points, 1)[0][:, 0] < _SAME_M**2
     moved = transform(T, points)
     distances2, near = nearest(tree, moved, 3)
-    normals = other.normals[tree.order][near]
+    normals = other.normals[tree.order][near]  # 0, a plane through all, on a ring of few beams
     off = np.abs(np.einsum("nki,nki->nk", normals, moved[:, None] - tree.points[near]))
     return np.asarray(same & ((distances2[:, 0] > _NEAR_M**2) | (off.min(axis=1) > _OFF_M)))
