@@ -128,7 +128,7 @@ def _warnings(alignment: Alignment) -> Iterator[str]:
             "tunnel does, and errors may be far larger than stated; start from odometry or --poses"
         )
     smear = alignment.smear
-    if smear is not None and smear.is_smeared:
+    if smear is not None and smear.is_smeared and alignment.rests:
         yield (
             f"warning: the sensor's motion smears the scans: {100 * smear.share:.0f} % of the "
             f"{1e3 * smear.moved_m:.0f} mm that surroundings move from scan to scan is within a "
