@@ -47,7 +47,7 @@ def test_a_whole_life(
     shutil.copy(model_path, model)
     assert go(Transition.TRANSITION_ACTIVATE) == (False, UNCONFIGURED)
     assert go(Transition.TRANSITION_CONFIGURE) == (False, UNCONFIGURED)
-    assert "cannot read /no/model.npz" in node.output()
+    assert "/no/model.npz: no such model file" in node.output()
     assert change("node.model", str(model)).successful
     assert go(Transition.TRANSITION_CONFIGURE) == (True, INACTIVE)
     heard = player.replay

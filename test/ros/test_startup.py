@@ -52,7 +52,7 @@ def test_a_parameter_that_ros_cannot_parse(tmp_path, domain_id) -> None:
 
 def test_a_missing_model(tmp_path, domain_id) -> None:
     words = last_words(tmp_path / "log", domain_id, {"node.model": tmp_path / "none.npz"})
-    assert f"cannot read {tmp_path / 'none.npz'}" in words
+    assert f"{tmp_path / 'none.npz'}: no such model file" in words
 
 
 @pytest.mark.parametrize("n_bytes", [0, 10, 1000])
@@ -88,7 +88,7 @@ def test_a_signal_ends_a_running_node_with_status_0(
 def test_a_node_that_died_is_noticed_with_its_last_words(tmp_path, domain_id) -> None:
     with NodeProcess(tmp_path / "log", domain_id, {"node.model": "/no/model"}) as process:
         process.wait(60.0)
-        with pytest.raises(NodeDiedError, match=r"status 1: covariance_node: cannot read /no"):
+        with pytest.raises(NodeDiedError, match=r"status 1: covariance_node: /no/model: no such model file"):
             process.check()
 
 
