@@ -33,7 +33,7 @@ from cello3d_ros.config import (
     sections_of,
 )
 from cello3d_ros.covariance.archive import read_arrays, write_arrays
-from cello3d_ros.covariance.features import KINDS
+from cello3d_ros.covariance.features import FEATURES, KINDS
 from cello3d_ros.covariance.heading import FRAMES, blended, out_of_motion
 from cello3d_ros.covariance.lost import Lost
 from cello3d_ros.covariance.sums import pack, squared_distances, unpack, weighted_sum
@@ -262,7 +262,7 @@ def load_model(name: Path | str = "general") -> Model:
         if isinstance(settings := header["config"].get(section), dict):
             settings.pop(name, None)
         config = config_from(header["config"])
-        return Model(
+        model = Model(
             **arrays,
             shape=header["shape"],
             frame=header.get("frame", "sensor"),  # since format 4
@@ -274,8 +274,14 @@ def load_model(name: Path | str = "general") -> Model:
             sampling=config.sampling,
             provenance=header["provenance"],
         )
+        if model.features == "global" and model.n_features != len(FEATURES):
+            raise ModelError(
+                f"it looks at {model.n_features} global features, where this version has "
+                f"{len(FEATURES)}: train it again"
+            )
     except (ModelError, ConfigError, OverflowError) as error:
         raise ModelError(f"{path}: {error}") from None
+    return model
 
 
 def shipped_model_path(name: str = "general") -> Path:

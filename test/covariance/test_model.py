@@ -742,3 +742,9 @@ def test_quantiles_that_are_none_are_refused() -> None:
             a_model(rho_quantiles=values)
     with pytest.raises(ModelError, match="features must be one of"):
         a_model(features="all")
+
+
+def test_a_model_of_other_global_features_is_refused_when_it_is_loaded(tmp_path: Path) -> None:
+    save_model(constant_model(np.eye(6), 13, features="global"), tmp_path / "old.npz")
+    with pytest.raises(ModelError, match=r"old.npz: it looks at 13 global features.*train it"):
+        load_model(tmp_path / "old.npz")
