@@ -45,7 +45,7 @@ def scans() -> InMemory:
 
 def test_every_pose_of_kiss_icp_gets_a_covariance_that_holds(scans, tmp_path, domain_id) -> None:
     arguments = ["-r", "external_odometry:=/odom"]
-    parameters = {"node.registration": "external"}
+    parameters = {"node.registration": "external", "node.pairing": "consecutive"}
     with NodeProcess(tmp_path / "log", domain_id, parameters, arguments) as node:
         player = replay.Player(domain_id, check=node.check)
         try:
