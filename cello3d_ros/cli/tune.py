@@ -98,8 +98,8 @@ def sentences(found: Tuning) -> Iterator[str]:
     )
     if found.rejected:
         yield (
-            f"{len(found.rejected)} pairs not used, sampling gave them no covariance: "
-            f"{_named(found.rejected)}"
+            f"{len(found.rejected)} pairs not used, sampling gave them no covariance or no plane "
+            f"holds some direction: {_named(found.rejected)}"
         )
     if found.flagged:
         yield (

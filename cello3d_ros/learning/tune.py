@@ -44,7 +44,7 @@ class Tuning:
     kind: SIZE, or EXAMPLES where the recording's own pairs joined those of the model as well.
     scale: factor on every covariance of the model.  before, after: figures of the model as it was
     and as tuned on the other blocks, over every pair that was held back but the flagged.
-    rejected: pairs to which sampling gave no covariance.
+    rejected: pairs to which sampling gave no covariance, or with a free direction.
     flagged: pairs that were not used, whose registrations do not agree with their pose
     (``pose_check``).  outliers: pairs that were judged but not fitted to, 30 times as far from the
     model as the median pair.
@@ -69,8 +69,9 @@ def tune(model: Model, dataset: Dataset) -> Tuning:
     found = dataset.pair_keys()
     rejected, keys = _split(found, np.array([not dataset.read(*key).accepted for key in found]))
     examples = select_inputs(load_examples([dataset], {key[0] for key in keys}), model.features)
-    free, keys = _split(keys, ~are_held(examples))
-    rejected, examples = rejected + free, select(examples, are_held(examples))
+    held = are_held(examples)
+    free, keys = _split(keys, ~held)
+    rejected, examples = rejected + free, select(examples, held)
     _check(model, examples, len(keys))
     agrees = np.array([not pose_check(xi).flagged for xi in examples.xi], np.bool_)
     flagged, keys = _split(keys, ~agrees)
