@@ -29,7 +29,7 @@ class ClosedForm(NamedTuple):
     sandwich: ``H^-1 (sum_i g_i g_i^T) H^-1``, what redrawing the reading does to the result to
     first order, g_i being the gradient that one reading point adds; trim_m: the distance up to
     which ICP's rules keep associations; residual_rms_m: root mean square of their point-to-plane
-    residuals; n_associations: how many there are; normal_variance: mean variance of their normals
+    residuals; n_associations: how many there are, of all the reading's points; normal_variance: mean variance of their normals
     about either axis of the plane, rad^2; held: least information of a direction against what
     errors of the normals alone make of it; free: the directions of the sensor that no plane
     holds, names of ``x y z roll pitch yaw``: along them both are too small.
@@ -39,7 +39,7 @@ class ClosedForm(NamedTuple):
     sandwich: Array
     trim_m: float
     residual_rms_m: float
-    n_associations: int
+    n_associations: float
     normal_variance: float
     held: float
     free: tuple[str, ...] = ()
@@ -52,34 +52,35 @@ def closed_form(
     overlap: Overlap,
     config: IcpConfig,
 ) -> ClosedForm:
-    """Compute both predictors from all points of two registered clouds.
+    """Compute both predictors from the associations of two registered clouds.
 
-    overlap: the clouds' associations.  H is the point-to-plane normal matrix of those that
-    ICP's rules keep.  ICP draws n_reading_points of the reading's N points, so both are scaled by
-    N / n_reading_points.  Raises FreeDirectionError where H is singular.
+    H is the point-to-plane normal matrix of those that ICP's rules keep.  ICP draws
+    n_reading_points of the reading, so both are scaled by N / n_reading_points where N of its
+    points were associated.  Raises FreeDirectionError where H is singular.
     """
     assert has_shape(reference)
     limit2 = _trim_limit(overlap.distances2, config)
     H, G, W, sum2, n = _normal_matrices(
-        reading.points,
-        transform(T_ref_read, reading.points),
+        overlap.points,
+        transform(T_ref_read, overlap.points),
         reference.points,
         reference.normals,
-        _normal_variances(reference),
+        reference.planarity,
+        reference.cylindricality,
         np.ascontiguousarray(T_ref_read[:3, :3]),
         overlap.distances2,
         overlap.indices,
         limit2,
     )
     inverse_H = _inverse(H)
-    drawn = _drawn(reading, config)
+    drawn = _drawn(reading, overlap, config)
     held, free = _held(H, _tilted(W))
     return ClosedForm(
         drawn * inverse_H,
         symmetrized(drawn * inverse_H @ G @ inverse_H),
         np.sqrt(limit2),
         np.sqrt(sum2 / max(n, 1)),
-        n,
+        n * len(reading.points) / len(overlap.points),
         W[3, 3] / max(n, 1),
         held,
         free,
@@ -102,25 +103,20 @@ def censi(
     Source: Prakhya et al. 2015, after Censi 2007, for the point-to-plane error.
     """
     kept = overlap.distances2 <= _trim_limit(overlap.distances2, config)
-    J_xx, spread = _implicit_derivative(reading, reference, T_ref_read, overlap.indices, kept)
+    found = _implicit_derivative(overlap.points, reference, T_ref_read, overlap.indices, kept)
+    (J_xx, spread), drawn = found, _drawn(reading, overlap, config)
     inverse = _inverse(J_xx)
-    return symmetrized(_drawn(reading, config) * sigma_m**2 * inverse @ spread @ inverse)
+    return symmetrized(drawn * sigma_m**2 * inverse @ spread @ inverse)
 
 
-def common_bias(
-    reading: Cloud,
-    reference: Cloud,
-    T_ref_read: Array,
-    overlap: Overlap,
-    config: IcpConfig,
-) -> Array:
+def common_bias(reference: Cloud, T_ref_read: Array, overlap: Overlap, config: IcpConfig) -> Array:
     """Return ``b = H^-1 sum J``: how far a bias of 1 m of all ranges moves ICP.  (6,), xi.
 
     The bias is along the normals, turned towards the reference's sensor.
     Source: Brossard et al. 2020, the correlated part of the sensor noise.
     """
     kept = overlap.distances2 <= _trim_limit(overlap.distances2, config)
-    J, _ = _jacobians(reading, reference, T_ref_read, overlap.indices)
+    J, _ = _jacobians(overlap.points, reference, T_ref_read, overlap.indices)
     towards = np.einsum("mi,mi->m", reference.normals, reference.points) < 0.0
     signs = np.where(towards, 1.0, -1.0)[overlap.indices] * kept
     H = np.einsum("nku,nkv->uv", J * kept[..., None], J, optimize=True)
@@ -128,15 +124,15 @@ def common_bias(
 
 
 def _jacobians(
-    reading: Cloud, reference: Cloud, T_ref_read: Array, indices: Indices
+    points: Array, reference: Cloud, T_ref_read: Array, indices: Indices
 ) -> tuple[Array, Array]:
     """Return ``J = [m, p x m]``, (N, k, 6), and ``m = R^T n``, (N, k, 3), of all associations."""
     m = reference.normals[indices] @ T_ref_read[:3, :3]
-    return np.concatenate([m, np.cross(reading.points[:, None], m)], axis=2), m
+    return np.concatenate([m, np.cross(points[:, None], m)], axis=2), m
 
 
 def _implicit_derivative(
-    reading: Cloud,
+    p: Array,
     reference: Cloud,
     T_ref_read: Array,
     indices: Indices,
@@ -147,8 +143,7 @@ def _implicit_derivative(
     With ``exp(xi) p = p + u + w x p + (w x u + w x (w x p)) / 2 + ...`` the second derivative of r
     is ``[[0, hat(m)/2], [-hat(m)/2, (m p^T + p m^T)/2 - (m . p) I]]``.
     """
-    p = reading.points
-    J, m = _jacobians(reading, reference, T_ref_read, indices)
+    J, m = _jacobians(p, reference, T_ref_read, indices)
     moved = transform(T_ref_read, p)[:, None] - reference.points[indices]
     r = np.einsum("nki,nki->nk", moved, reference.normals[indices]) * kept
     J = J * kept[..., None]
@@ -172,9 +167,9 @@ def _trim_limit(distances2: Array, config: IcpConfig) -> float:
     return float(np.partition(distances2, rank, axis=None)[rank])
 
 
-def _drawn(reading: Cloud, config: IcpConfig) -> float:
-    """Return how many times fewer points of the reading ICP draws than there are."""
-    return len(reading.points) / n_drawn(len(reading.points), config.n_reading_points)
+def _drawn(reading: Cloud, overlap: Overlap, config: IcpConfig) -> float:
+    """Return how many times fewer points of the reading ICP draws than were associated."""
+    return len(overlap.points) / n_drawn(len(reading.points), config.n_reading_points)
 
 
 def _inverse(H: Array) -> Array:
@@ -185,15 +180,6 @@ def _inverse(H: Array) -> Array:
     if free.any():
         raise free_error(_named(vectors[:, free]))
     return np.asarray(np.outer(scale, scale) * ((vectors / eigenvalues) @ vectors.T))
-
-
-def _normal_variances(cloud: Cloud) -> Array:
-    """Return the variance of each normal about either axis of its plane, rad^2.  (N,).
-
-    That of a line's slope: ``s3^2`` of the points about it over ``k s2^2``.
-    """
-    spread = np.maximum(1.0 - cloud.cylindricality, 1e-9)  # s2 / s1
-    return np.asarray((1.0 - cloud.planarity / spread) ** 2 / _N_NEIGHBORS)
 
 
 def _tilted(W: Array) -> Array:
@@ -248,7 +234,8 @@ def _normal_matrices(
     moved: Array,
     points: Array,
     normals: Array,
-    variances: Array,
+    planarity: Array,
+    cylindricality: Array,
     R: Array,
     distances2: Array,
     indices: Indices,
@@ -256,8 +243,9 @@ def _normal_matrices(
 ) -> tuple[Array, Array, Array, float, int]:
     """Return H = sum J^T J, G = sum_i g_i g_i^T and W = sum_i w_i [p_i; 1] [p_i; 1]^T.
 
-    Over one point's neighbours g_i is the sum of J^T r, w_i that of the normals' variances.  The
-    fourth is sum r^2, the fifth how many associations all of these are sums of.
+    Over one point's neighbours g_i is the sum of J^T r, w_i that of the normals' variances about
+    either axis of their planes, rad^2, each that of a line's slope: ``s3^2`` of the points about
+    it over ``k s2^2``.  The fourth is sum r^2, the fifth how many associations these sum over.
 
     The residual of ``T exp(xi) p`` has the Jacobian ``[m, p x m]``, m = R^T n: the reading side.
     All of one point's are ``A m`` with the same ``A = [I; hat(p)]``, so that it adds
@@ -280,7 +268,8 @@ def _normal_matrices(
                 continue
             sum2 += r * r
             n += 1
-            w += variances[q]
+            spread = max(1.0 - cylindricality[q], 1e-9)  # s2 / s1
+            w += (1.0 - planarity[q] / spread) ** 2 / _N_NEIGHBORS
             x = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
             y = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
             z = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz

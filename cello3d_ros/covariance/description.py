@@ -16,19 +16,19 @@ from cello3d_ros.errors import NoOverlapError
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.registration.overlap import Overlap, find_overlap
 
+_N_LOOKED_AT = 10_000  # points of the reading that tell all but a descriptor
+
 
 class Description(NamedTuple):
     """A registered pair as methods and models see it, whoever registered it.
 
-    n_overlap: overlapping points of both clouds; overlap_ratio: share of the reading's points;
-    descriptors: (n_rotations, n_features), the k-th after a turn of the reading frame by
-    2 pi k / n_rotations about z; features: the numbers that ``FEATURES`` names; shapes: cheap
-    predictors by name, each (6, 6), reading side; overlap: the associations that all of it comes
-    from; motion: (2,), what ``motion_of`` finds; free: the directions of the sensor that no plane
-    holds (``ClosedForm``).
+    overlap_ratio: share of the reading's points; descriptors: (n_rotations, n_features), the k-th
+    after a turn of the reading frame by 2 pi k / n_rotations about z; features: the numbers that
+    ``FEATURES`` names; shapes: cheap predictors by name, each (6, 6), reading side; overlap: the
+    associations that all of it comes from; motion: (2,), what ``motion_of`` finds; free: the
+    directions of the sensor that no plane holds (``ClosedForm``).
     """
 
-    n_overlap: int
     overlap_ratio: float
     descriptors: Array
     features: Array
@@ -48,19 +48,20 @@ def describe(
 ) -> Description:
     """Describe a registered pair.
 
-    T_ref_read: (4, 4); n_rotations: 0 where nobody looks at descriptors, which then are not made;
-    n_threads changes no result.  Raises NoOverlapError when too little overlaps and
+    T_ref_read: (4, 4); n_rotations: 0 where nobody looks at descriptors, which then are not made:
+    all else are means and shares, which 10 000 points of the reading tell as well.  n_threads
+    changes no result.  Raises NoOverlapError when too little overlaps and
     FreeDirectionError when the normal equations are singular.
     """
     radius_m, k = pipeline.overlap.radius_m, pipeline.icp.n_neighbors
-    overlap = find_overlap(reading, reference, T_ref_read, radius_m, k, n_threads)
+    n_looked_at = 0 if n_rotations else _N_LOOKED_AT
+    overlap = find_overlap(reading, reference, T_ref_read, radius_m, k, n_threads, n_looked_at)
     _check_overlap(overlap, pipeline)
     found = closed_form(reading, reference, T_ref_read, overlap, pipeline.icp)
     shapes = {"hessian": found.inverse_H, "sandwich": found.sandwich}
     descriptors = _descriptors(reading, reference, T_ref_read, overlap, pipeline, n_rotations)
     features = global_features(reading, reference, T_ref_read, overlap, found, pipeline.icp)
     return Description(
-        overlap.n_points,
         overlap.ratio,
         descriptors,
         features,

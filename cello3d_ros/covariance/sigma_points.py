@@ -35,7 +35,7 @@ def sigma_points(case: Case) -> Array:
 def sensor_term(case: Case) -> Array:
     """Return ``sigma^2 (2 H^-1 + 2 b b^T)``: independent noise and a common bias, two clouds."""
     found = case.description
-    b = common_bias(case.reading, case.reference, case.T_hat, found.overlap, case.pipeline.icp)
+    b = common_bias(case.reference, case.T_hat, found.overlap, case.pipeline.icp)
     inverse_H = found.shapes["hessian"]
     return np.asarray(2.0 * case.settings.sigma_m**2 * (inverse_H + np.outer(b, b)))
 

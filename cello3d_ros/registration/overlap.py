@@ -16,11 +16,13 @@ from cello3d_ros.geometry.se3 import Array, inverse, transform
 class Overlap(NamedTuple):
     """How two registered clouds meet.
 
-    reading: (N,) and reference: (M,), true where a point has a neighbour in the other cloud;
-    distances2, indices: (N, k), squared distances and indices of each reading point's k nearest
-    reference points, closest first.
+    points: (N, 3), the reading's points that are looked at, all or some, in its frame; reading:
+    (N,), true where one has a neighbour in the reference; reference: (M,), true where a point has
+    a neighbour in the reading, as far as those looked at tell; distances2, indices: (N, k),
+    squared distances and indices of each point's k nearest reference points, closest first.
     """
 
+    points: Array
     reading: NDArray[np.bool_]
     reference: NDArray[np.bool_]
     distances2: Array
@@ -28,7 +30,7 @@ class Overlap(NamedTuple):
 
     @property
     def n_points(self) -> int:
-        """Number of overlapping points, of both clouds."""
+        """Number of overlapping points, of both clouds, among those looked at."""
         return int(self.reading.sum() + self.reference.sum())
 
     @property
@@ -44,22 +46,28 @@ def find_overlap(
     radius_m: float,
     k: int = 1,
     n_threads: int = 1,
+    n_looked_at: int = 0,
 ) -> Overlap:
     """Return the points of two clouds that are at most ``radius_m`` from the other cloud.
 
     T_ref_read: (4, 4), p_ref = T_ref_read p_read.  A reference point that is near enough among the
     neighbours of a reading point overlaps; the others look for a reading point themselves.
+    n_looked_at: of more points of the reading so many are looked at, evenly spaced in its order
+    and so in space; they stand for all, and no reference point looks for one itself.  0: all.
     Source: S of Sec. IV-C.
     """
-    moved = transform(T_ref_read, reading.points)
-    distances2, indices = nearest(reference.tree, moved, k, n_threads)
-    near = np.zeros(len(reading.points), np.bool_)
+    points, n = reading.points, len(reading.points)
+    if is_part := 0 < n_looked_at < n:
+        points = points.take(np.arange(n_looked_at) * n // n_looked_at, axis=0)
+    distances2, indices = nearest(reference.tree, transform(T_ref_read, points), k, n_threads)
+    near = np.zeros(len(points), np.bool_)
     overlaps = np.zeros(len(reference.points), np.bool_)
     _mark(distances2, indices, radius_m**2, near, overlaps)
-    rest = np.flatnonzero(~overlaps)
-    back = transform(inverse(T_ref_read), reference.points.take(rest, axis=0))
-    overlaps[rest] = any_within(reading.tree, back, radius_m, n_threads)
-    return Overlap(near, overlaps, distances2, indices)
+    if not is_part:
+        rest = np.flatnonzero(~overlaps)
+        back = transform(inverse(T_ref_read), reference.points.take(rest, axis=0))
+        overlaps[rest] = any_within(reading.tree, back, radius_m, n_threads)
+    return Overlap(points, near, overlaps, distances2, indices)
 
 
 @kernel()

@@ -18,14 +18,14 @@ from cello3d_ros.registration.icp import icp
 from cello3d_ros.registration.overlap import Overlap
 
 
-def overlap_of(distances2, indices):
+def overlap_of(points, distances2, indices):
     """The associations of an overlap, of which closed forms need no more."""
-    return Overlap(np.empty(0), np.empty(0), distances2, indices)
+    return Overlap(points, np.empty(0), np.empty(0), distances2, indices)
 
 
 def predictors(reading, reference, T, config):
     moved = transform(T, reading.points)
-    found = overlap_of(*nearest(reference.tree, moved, config.n_neighbors))
+    found = overlap_of(reading.points, *nearest(reference.tree, moved, config.n_neighbors))
     return closed_form(reading, reference, T, found, config)
 
 
@@ -34,7 +34,7 @@ def normal_matrix(points, normals):
     n = len(points)
     zeros, own = np.zeros((n, 1)), np.arange(n)[:, None]
     H, G, _, _, _ = _normal_matrices(
-        points, points, points, normals, np.zeros(n), np.eye(3), zeros, own, 1.0
+        points, points, points, normals, np.ones(n), np.zeros(n), np.eye(3), zeros, own, 1.0
     )
     np.testing.assert_array_equal(G, 0.0)  # no residuals
     return H
@@ -185,9 +185,9 @@ def test_points_without_a_plane_count_for_nothing():
     alone, swapped = (np.take_along_axis(a, order, axis=1) for a in (alone, indices))
     every = IcpConfig(trim_ratio=1.0)
     reading = cloud(P, normals)
-    found = closed_form(reading, cloud(Q, bare), T, overlap_of(distances2, indices), every)
+    found = closed_form(reading, cloud(Q, bare), T, overlap_of(P, distances2, indices), every)
     config = IcpConfig(trim_ratio=float(np.isfinite(alone).mean()) - 1e-6)
-    expected = closed_form(reading, cloud(Q, normals), T, overlap_of(alone, swapped), config)
+    expected = closed_form(reading, cloud(Q, normals), T, overlap_of(P, alone, swapped), config)
     np.testing.assert_allclose(found.inverse_H, expected.inverse_H, rtol=1e-9)
     np.testing.assert_allclose(found.sandwich, expected.sandwich, rtol=1e-9)
     assert found.n_associations == expected.n_associations == half[indices].sum()
@@ -267,7 +267,7 @@ def test_censi_is_the_derivative_of_the_minimum_by_every_coordinate():
     expected = 0.02**2 * np.array(D).T @ np.array(D)
     share = near.sum() / near.size
     config = IcpConfig(n_neighbors=2, trim_ratio=float(share) - 1e-9, n_reading_points=18)
-    overlap = overlap_of(distances2, indices)
+    overlap = overlap_of(P, distances2, indices)
     found = censi(cloud(P, normals), cloud(Q, normals), T, overlap, config, 0.02)
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
@@ -294,14 +294,15 @@ def test_the_second_derivative_holds_away_from_the_minimum_too():
         ]
         for b in E
     ]
-    found, _ = _implicit_derivative(cloud(P, normals), cloud(Q, normals), T, indices, near)
+    found, _ = _implicit_derivative(P, cloud(Q, normals), T, indices, near)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-3)
 
 
 def test_censi_grows_with_the_noise_and_refuses_free_directions(pair):
     reading, reference, T = pair
     config = IcpConfig()
-    found = overlap_of(*nearest(reference.tree, transform(T, reading.points), config.n_neighbors))
+    moved = transform(T, reading.points)
+    found = overlap_of(reading.points, *nearest(reference.tree, moved, config.n_neighbors))
     small = censi(reading, reference, T, found, config, 0.01)
     large = censi(reading, reference, T, found, config, 0.03)
     np.testing.assert_allclose(large, 9.0 * small, rtol=1e-12)
@@ -309,7 +310,7 @@ def test_censi_grows_with_the_noise_and_refuses_free_directions(pair):
     ground = prepare(
         plane(np.random.default_rng(37), 2, -1.0, 3000)[0], CloudConfig(), np.random.default_rng(0)
     )
-    itself = overlap_of(*nearest(ground.tree, ground.points, config.n_neighbors))
+    itself = overlap_of(ground.points, *nearest(ground.tree, ground.points, config.n_neighbors))
     with pytest.raises(RegistrationError, match="holds x, y, yaw of the sensor"):
         censi(ground, ground, np.eye(4), itself, config, 0.01)
 
@@ -318,7 +319,7 @@ def test_the_common_bias_is_the_answer_to_equal_residuals(pair):
     reading, reference, T = pair
     every = IcpConfig(n_neighbors=1, trim_ratio=1.0)
     distances2, indices = nearest(reference.tree, transform(T, reading.points), 1)
-    b = common_bias(reading, reference, T, overlap_of(distances2, indices), every)
+    b = common_bias(reference, T, overlap_of(reading.points, distances2, indices), every)
     n = reference.normals[indices[:, 0]]
     n = np.where(np.einsum("ij,ij->i", n, reference.points[indices[:, 0]])[:, None] < 0, n, -n)
     m = n @ T[:3, :3]

@@ -5,6 +5,7 @@ import pytest
 
 from cello3d_ros.clouds.shape import prepare
 from cello3d_ros.config import CloudConfig, IcpConfig, Pipeline
+from cello3d_ros.covariance import description
 from cello3d_ros.covariance.description import describe, turns
 from cello3d_ros.covariance.features import FEATURES, model_inputs
 from cello3d_ros.geometry.se3 import exp, hat, inverse, transform
@@ -19,9 +20,9 @@ def pair(room):
     return reading, prepare(room[1], CloudConfig(), rng)
 
 
-def by_name(description):
-    assert description.features.shape == (len(FEATURES),)
-    return dict(zip(FEATURES, description.features, strict=True))
+def by_name(found):
+    assert found.features.shape == (len(FEATURES),)
+    return dict(zip(FEATURES, found.features, strict=True))
 
 
 def rms(vectors):
@@ -122,3 +123,20 @@ def test_inputs_are_the_turned_descriptors_or_one_row():
     both = model_inputs("both", descriptors, features)
     assert both.shape == (2, 1, 6)
     np.testing.assert_array_equal(both[1, 0], [9.0, 10.0, 12.0, 13.0, 14.0, 15.0])
+
+
+def test_part_of_the_reading_tells_what_all_of_it_tells(room, monkeypatch):
+    """Nothing but a descriptor needs every point: one in four changes no input by much."""
+    rng = np.random.default_rng(0)
+    config = Pipeline(cloud=CloudConfig(voxel_m=0.01))
+    pair = [prepare(points, config.cloud, rng) for points in room]
+    every = describe(*pair, T_HAT, config, n_rotations=0)
+    monkeypatch.setattr(description, "_N_LOOKED_AT", len(pair[0].points) // 4)
+    some = describe(*pair, T_HAT, config, n_rotations=0)
+    whole = describe(*pair, T_HAT, config, n_rotations=1)
+    assert len(some.overlap.points) == len(pair[0].points) // 4
+    np.testing.assert_array_equal(whole.features, every.features)
+    np.testing.assert_allclose(some.features, every.features, atol=0.12)
+    for name in every.shapes:
+        ratio = np.diag(some.shapes[name]) / np.diag(every.shapes[name])
+        np.testing.assert_allclose(ratio, 1.0, atol=0.15)

@@ -62,7 +62,7 @@ def test_the_points_have_the_mean_and_covariance_of_the_prior():
 
 def test_the_sensor_term_is_that_of_two_clouds_and_a_common_bias(pair):
     case = seen(pair, sigma_m=0.03)
-    b = common_bias(*pair, T_HAT, case.description.overlap, Pipeline().icp)
+    b = common_bias(pair[1], T_HAT, case.description.overlap, Pipeline().icp)
     H_inverse = closed_form(*pair, T_HAT, case.description.overlap, Pipeline().icp).inverse_H
     expected = 0.03**2 * (2 * H_inverse + 2 * np.outer(b, b))
     np.testing.assert_allclose(sensor_term(case), expected, rtol=1e-9)

@@ -43,3 +43,20 @@ def test_overlap_is_that_of_all_distances_whatever_the_number_of_threads(room):
     np.testing.assert_allclose(found.distances2, np.sort(squares, axis=1)[:, :3], atol=1e-12)
     for a, b in zip(found, find_overlap(reading, reference, T, 0.1, 3, n_threads=2)):
         np.testing.assert_array_equal(a, b)
+
+
+def test_points_evenly_spaced_stand_for_all(room):
+    T = exp([0.3, -0.2, 0.1, 0.05, 0.0, 0.4])
+    reading, reference = cloud(room[0][:6000]), cloud(room[1][:3000])
+    every, some = (find_overlap(reading, reference, T, 0.1, 3, n_looked_at=n) for n in (0, 1500))
+    n = len(reading.points)
+    looked_at = np.arange(1500) * n // 1500
+    assert n >= 5500 and (np.diff(looked_at) <= n // 1500 + 1).all()
+    np.testing.assert_array_equal(some.points, reading.points[looked_at])
+    np.testing.assert_array_equal(some.reading, every.reading[looked_at])
+    np.testing.assert_array_equal(some.indices, every.indices[looked_at])
+    assert abs(some.ratio - every.ratio) < 0.03
+    assert (some.reference <= every.reference).all()
+    for n_looked_at in (0, n, n + 1):
+        found = find_overlap(reading, reference, T, 0.1, 3, n_looked_at=n_looked_at)
+        np.testing.assert_array_equal(found.reference, every.reference)
