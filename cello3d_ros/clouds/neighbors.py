@@ -26,7 +26,7 @@ from cello3d_ros.compiled import kernel
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.threads import in_threads
 
-__all__ = ["Indices", "KdTree", "any_within", "build_tree", "nearest", "search"]
+__all__ = ["NO_TREE", "Indices", "KdTree", "any_within", "build_tree", "nearest", "search"]
 
 _CHUNK = 4096  # queries of one task, a multiple of 16
 
@@ -48,6 +48,10 @@ class KdTree(NamedTuple):
     def leaves(self) -> Leaves:
         """The part that is searched."""
         return Leaves(self.lanes, self.boxes, self.children)
+
+
+_NONE = np.empty(0, np.int64)
+NO_TREE = KdTree(np.empty((0, 3)), _NONE, np.empty((0, 3, 16)), np.empty((0, 6, 16)), _NONE)
 
 
 def build_tree(points: Array, n_threads: int = 1) -> KdTree:

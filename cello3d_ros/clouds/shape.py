@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cello3d_ros.clouds.covariances import covariances
 from cello3d_ros.clouds.filters import crop_range, is_planar, limit_density
 from cello3d_ros.clouds.leaves import WIDTH
-from cello3d_ros.clouds.neighbors import KdTree, build_tree
+from cello3d_ros.clouds.neighbors import NO_TREE, KdTree, build_tree
 from cello3d_ros.clouds.particles import without_particles
 from cello3d_ros.compiled import kernel
 from cello3d_ros.config import CloudConfig
@@ -27,10 +27,10 @@ WIDENINGS = (1, 2, 3)  # times the neighbours that are tried until they are not 
 class Cloud(NamedTuple):
     """A filtered scan with its local shape, computed once and used in both roles.
 
-    points: (N, 3), metres, sensor frame, in the order of the tree, so that neighbours in space
-    are near in memory; normals: (N, 3), unit, sign arbitrary, 0 where there is no plane;
-    planarity, cylindricality: (N,), in [0, 1]; these three are empty before ``with_shape``; tree:
-    k-d tree of the points.
+    points: (N, 3), metres, sensor frame; normals: (N, 3), unit, sign arbitrary, 0 where there is
+    no plane; planarity, cylindricality: (N,), in [0, 1]; tree: k-d tree of the points.  All but
+    the points are empty before ``with_shape``, which brings the points into the order of the tree,
+    so that neighbours in space are near in memory.
     """
 
     points: Array
@@ -48,13 +48,11 @@ def prepare(
     points: (N, 3) finite, sensor frame; the result does not depend on n_threads.  Raises
     CloudError when fewer than ``n_neighbors`` are left after the filters.
     """
-    return with_shape(filtered(points, config, rng, n_threads), config, n_threads)
+    return with_shape(filtered(points, config, rng), config, n_threads)
 
 
-def filtered(
-    points: Array, config: CloudConfig, rng: np.random.Generator, n_threads: int = 1
-) -> Cloud:
-    """Do the first part of ``prepare``: a cloud whose local shape nobody knows yet."""
+def filtered(points: Array, config: CloudConfig, rng: np.random.Generator) -> Cloud:
+    """Do the first part of ``prepare``: a cloud without tree and local shape, in given order."""
     cropped = crop_range(points, config.min_range_m, config.max_range_m)
     if config.min_support > 0.0:
         cropped = without_particles(cropped, config.min_support)
@@ -69,17 +67,16 @@ def filtered(
             "the cloud is a 2-D scan, all its points lie in one plane with the sensor: it leaves "
             "height, roll and pitch free; a 3-D lidar is needed"
         )
-    tree = build_tree(kept, n_threads)
-    tree = tree._replace(order=np.arange(len(kept)))
-    return Cloud(tree.points, np.empty((0, 3)), np.empty(0), np.empty(0), tree)
+    return Cloud(kept, np.empty((0, 3)), np.empty(0), np.empty(0), NO_TREE)
 
 
 def with_shape(cloud: Cloud, config: CloudConfig, n_threads: int = 1) -> Cloud:
     """Do the second part of ``prepare``, unless it has been done."""
     if has_shape(cloud):
         return cloud
-    shape = local_shape(cloud.tree, config.n_neighbors, n_threads, config.min_spread)
-    return Cloud(cloud.points, *shape, cloud.tree)
+    tree = build_tree(cloud.points, n_threads)
+    shape = local_shape(tree, config.n_neighbors, n_threads, config.min_spread)
+    return Cloud(tree.points, *shape, tree._replace(order=np.arange(len(tree.points))))
 
 
 def has_shape(cloud: Cloud) -> bool:

@@ -231,7 +231,7 @@ class Estimator:
         """Return a scan after the filters.  Raises CloudError that says which one it is."""
         config, n_threads = self.pipeline.cloud, self.settings.n_threads
         try:
-            cloud = filtered(points, config, rng, n_threads)
+            cloud = filtered(points, config, rng)
         except CloudError as error:
             raise CloudError(f"the {what}: {error}") from None
         return with_shape(cloud, config, n_threads) if with_its_shape else cloud

@@ -23,7 +23,7 @@ import numpy as np
 from cello3d_ros.clouds.filters import subsample
 from cello3d_ros.clouds.leaves import tree_order
 from cello3d_ros.clouds.neighbors import Indices, KdTree, build_tree, nearest
-from cello3d_ros.clouds.shape import Cloud
+from cello3d_ros.clouds.shape import Cloud, has_shape
 from cello3d_ros.config import IcpConfig
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.registration.kernels import (
@@ -100,6 +100,8 @@ def register(
         tree = build_tree(reference.points.take(ref, axis=0))
         normals = normals.take(ref.take(tree.order), axis=0)
     points = reading.points.take(read, axis=0)
+    if not has_shape(reading):  # then it is in no order yet
+        points = points.take(tree_order(points), axis=0)
     return _register(points, tree, normals, T_init, config, n_threads)
 
 

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cello3d_ros.clouds.filters import subsample
+from cello3d_ros.clouds.leaves import tree_order
 from cello3d_ros.clouds.neighbors import Indices, any_within, nearest
 from cello3d_ros.clouds.shape import Cloud
 from cello3d_ros.compiled import kernel
@@ -52,18 +54,19 @@ def find_overlap(
 
     T_ref_read: (4, 4), p_ref = T_ref_read p_read.  A reference point that is near enough among the
     neighbours of a reading point overlaps; the others look for a reading point themselves.
-    n_looked_at: of more points of the reading so many are looked at, evenly spaced in its order
-    and so in space; they stand for all, and no reference point looks for one itself.  0: all.
+    n_looked_at: so many of the reading's points, drawn at random but always the same, stand for
+    all, and no reference point looks for one itself: it needs no tree of the reading.  0: all.
     Source: S of Sec. IV-C.
     """
-    points, n = reading.points, len(reading.points)
-    if is_part := 0 < n_looked_at < n:
-        points = points.take(np.arange(n_looked_at) * n // n_looked_at, axis=0)
+    points = reading.points
+    if n_looked_at > 0:
+        some = points.take(subsample(len(points), n_looked_at, np.random.default_rng(0)), axis=0)
+        points = some.take(tree_order(some), axis=0)
     distances2, indices = nearest(reference.tree, transform(T_ref_read, points), k, n_threads)
     near = np.zeros(len(points), np.bool_)
     overlaps = np.zeros(len(reference.points), np.bool_)
     _mark(distances2, indices, radius_m**2, near, overlaps)
-    if not is_part:
+    if n_looked_at == 0:
         rest = np.flatnonzero(~overlaps)
         back = transform(inverse(T_ref_read), reference.points.take(rest, axis=0))
         overlaps[rest] = any_within(reading.tree, back, radius_m, n_threads)

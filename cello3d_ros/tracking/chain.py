@@ -38,7 +38,7 @@ class Frame:
         if self.sweep is not None and self.velocity is not None:
             points = undistorted(*self.sweep, Motion.constant(self.velocity))
             rng = np.random.default_rng(self.stamp_ns % 2**63)
-            self.cloud = filtered(points, config, rng, n_threads)
+            self.cloud = filtered(points, config, rng)
             self.sweep = None
         self.cloud = with_shape(self.cloud, config, n_threads)
         return self.cloud

@@ -156,7 +156,7 @@ class Tracker:
         sweep = None if time_s is None or place.motion is not None else (points, time_s)
         points, deskewed = self._deskewed(stamp_ns, points, place, time_s)
         rng = draws(points, self.config.seed)
-        cloud = filtered(points, self.pipeline.cloud, rng, _N_THREADS)
+        cloud = filtered(points, self.pipeline.cloud, rng)
         frame = self._in_chain(Frame(stamp_ns, cloud, place, place.T_odom_sensor, sweep))
         reference = self._pairing.reference(frame, self._chain, self.config, self.pipeline.cloud)
         if reference is None:

