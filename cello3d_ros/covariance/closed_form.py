@@ -29,10 +29,10 @@ class ClosedForm(NamedTuple):
     sandwich: ``H^-1 (sum_i g_i g_i^T) H^-1``, what redrawing the reading does to the result to
     first order, g_i being the gradient that one reading point adds; trim_m: the distance up to
     which ICP's rules keep associations; residual_rms_m: root mean square of their point-to-plane
-    residuals; n_associations: how many there are, of all the reading's points; normal_variance: mean variance of their normals
-    about either axis of the plane, rad^2; held: least information of a direction against what
-    errors of the normals alone make of it; free: the directions of the sensor that no plane
-    holds, names of ``x y z roll pitch yaw``: along them both are too small.
+    residuals; n_associations: how many all of the reading has; normal_variance: mean variance of
+    their normals about either axis of the plane, rad^2; held: least information of a direction
+    against what errors of the normals alone make of it; free: the directions of the sensor that
+    no plane holds, names of ``x y z roll pitch yaw``: along them both are too small.
     """
 
     inverse_H: Array
