@@ -11,13 +11,15 @@ profile, mode cello3d; ``fused_p50_ms`` and ``fused_p95_ms`` the same in mode fu
 process, cloud by cloud in turns with KISS-ICP on the same points: ``in_process_*`` is from the
 bytes of a message to the published answer, ``registration_ms`` registration and covariance
 alone with what is done after the answer for the next one (``finish_ms`` of it), ``kiss_icp_ms``
-one call of KISS-ICP's ``register_frame``; each a median of wall times.
-``cpu_ratio_to_kiss_icp`` is the same ratio of processor times, which other load disturbs less.
+one call of KISS-ICP's ``register_frame``; each a mean of wall times, as only some scans become
+keyframes.  ``cpu_ratio_to_kiss_icp`` is the same ratio of processor times, which other load
+disturbs less.
 
 The second sends clouds of a hall at some rate whatever the node does.  ``minutes`` tells the
 latency and the node's memory minute by minute (or part of one, where the whole is shorter than
-five); ``memory_growth_mb`` is what the last has more than the second, ``dropped`` what had no
-answer, ``work_ms`` the time between answers of a node that is never idle.
+five); ``memory_growth_mb`` is what the last has more than the second, ``answered_share`` that of
+the clouds after the first reference, ``dropped`` what had no answer, ``work_ms`` the time between
+answers of a node that is never idle.
 """
 
 from __future__ import annotations
@@ -121,6 +123,7 @@ def over_dds(scans: InMemory, rate_hz: float, parameters: dict[str, Any]) -> dic
     return {
         **quantiles(replay.latencies_ms()[N_SKIPPED:]),
         "answered": len(replay.poses),
+        "answered_share": len(replay.poses) / (len(scans) - 1),
         "dropped": len(scans) - len(replay.poses) - 1,
         "peak_memory_mb": node.peak_memory_mb,
     }
@@ -173,15 +176,15 @@ def in_process(scans: InMemory, parameters: dict[str, Any]) -> dict[str, Any]:
     work_ms, work_cpu_ms = np.add(alone.wall_ms, after.wall_ms), np.add(alone.cpu_ms, after.cpu_ms)
     result: dict[str, Any] = {
         **{f"in_process_{k}": v for k, v in quantiles(until_answer[N_SKIPPED:]).items()},
-        "registration_ms": median(work_ms),
-        "finish_ms": median(after.wall_ms),
-        "registration_cpu_ms": median(work_cpu_ms),
-        "kiss_icp_ms": median(kiss.wall_ms) if register_frame is not None else None,
+        "registration_ms": mean(work_ms),
+        "finish_ms": mean(after.wall_ms),
+        "registration_cpu_ms": mean(work_cpu_ms),
+        "kiss_icp_ms": mean(kiss.wall_ms) if register_frame is not None else None,
     }
     if register_frame is not None:
         result["ratio_to_kiss_icp"] = result["registration_ms"] / result["kiss_icp_ms"]
-        result["kiss_icp_cpu_ms"] = median(kiss.cpu_ms)
-        result["cpu_ratio_to_kiss_icp"] = median(work_cpu_ms) / result["kiss_icp_cpu_ms"]
+        result["kiss_icp_cpu_ms"] = mean(kiss.cpu_ms)
+        result["cpu_ratio_to_kiss_icp"] = mean(work_cpu_ms) / result["kiss_icp_cpu_ms"]
     return result
 
 
@@ -257,6 +260,7 @@ def loaded(
         "sent": len(sent),
         "received": int(last["received"]),
         "answered": len(poses),
+        "answered_share": len(poses) / (len(sent) - int(last["references"])),
         "dropped": len(sent) - len(poses) - int(last["references"]),
         "dropped_by_reason": {
             key.removeprefix("dropped."): int(value)
@@ -265,7 +269,9 @@ def loaded(
         },
         **quantiles(list(latency_ms.values())[N_SKIPPED:]),
         "max_ms": max(list(latency_ms.values())[N_SKIPPED:]),
-        "work_ms": 1e3 * median(np.diff(answered_s)),
+        "work_ms": 1e3 * float(np.median(np.diff(answered_s)[N_SKIPPED:])),
+        "memory_start_mb": sent[min(N_SKIPPED, len(sent) - 1)][1],
+        "memory_end_mb": sent[-1][1],
         "memory_growth_mb": minutes[-1]["memory_mb"] - minutes[1]["memory_mb"],
         "minutes": minutes,
         "exit_status": status,
@@ -330,9 +336,9 @@ def quantiles(values_ms: list[float]) -> dict[str, float | None]:
     return {"p50_ms": float(p50), "p95_ms": float(p95)}
 
 
-def median(values: Any) -> float:
-    """Return the median without the beginning."""
-    return float(np.median(values[N_SKIPPED:]))
+def mean(values: Any) -> float:
+    """Return the mean without the beginning."""
+    return float(np.mean(values[N_SKIPPED:]))
 
 
 if __name__ == "__main__":

@@ -61,7 +61,8 @@ def _neighbors(points: Array) -> tuple[Counts, Counts]:
     rows = ((np.arcsin(sines) + 0.5 * np.pi) / _CELL_RAD).astype(np.int64)
     cells = rows * n_azimuths + columns
     order = np.argsort(cells, kind="stable")
-    starts = np.searchsorted(cells[order], np.arange(n_azimuths * n_elevations + 1))
+    starts = np.zeros(n_azimuths * n_elevations + 1, np.int64)
+    np.cumsum(np.bincount(cells, minlength=len(starts) - 1), out=starts[1:])
     logs = np.log(np.maximum(ranges, 1e-9))[order]
     n_others, n_alike = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
     n_others[order], n_alike[order] = _counted(logs, cells[order], starts, n_azimuths)

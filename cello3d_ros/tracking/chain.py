@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +33,11 @@ class Frame:
     T_odom_sensor: Array | None
     sweep: tuple[Array, Array] | None = None
     velocity: Array | None = None  # (6,), by which the motion is to be undone
+
+    @functools.cached_property
+    def range_m(self) -> float:
+        """Median range of its points."""
+        return float(np.median(np.linalg.norm(self.cloud.points, axis=1)))
 
     def shaped(self, config: CloudConfig, n_threads: int) -> Cloud:
         """Return the cloud with its local shape, which is found once, when it is needed."""

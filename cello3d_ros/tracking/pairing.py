@@ -157,9 +157,8 @@ def makes_keyframe(found: Estimate, reference: Frame, config: PairingConfig) -> 
     """
     way_m = np.linalg.norm(found.T_ref_read[:3, 3])
     angle_rad = np.linalg.norm(se3.log(found.T_ref_read)[3:])
-    range_m = np.median(np.linalg.norm(reference.cloud.points, axis=1))
     return bool(
-        way_m > config.keyframe_distance_ratio * range_m
+        way_m > config.keyframe_distance_ratio * reference.range_m
         or angle_rad > config.keyframe_angle_rad
         or found.overlap_ratio < config.keyframe_min_overlap
     )
