@@ -162,6 +162,11 @@ def _tables(found: Evaluation) -> Iterator[str]:
         yield from _table("trajectories", _TRAJECTORY, rows)
     model = found.methods["cello3d"]
     yield ""
+    if found.n_free:
+        yield (
+            f"{found.n_free} pairs are left out: no plane holds some direction, so the node "
+            "gives them no answer."
+        )
     yield (
         f"On these {found.n_pairs} pairs the model's covariances are {model.verdict} "
         f"(D2/6 {model.dm2_over_6:.2g}); {model.coverage_95:.0%} of the errors lie within its "

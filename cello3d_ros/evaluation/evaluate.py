@@ -108,7 +108,7 @@ def evaluate(
     recordings = _recordings(settings.recordings, names, opened)
     baseline = [open_dataset(folder) for folder in settings.baseline]
     mean = mean_of(baseline) if baseline else training_mean(loaded)
-    examples, keys = _answered(opened, names)
+    examples, keys, n_free = _answered(opened, names)
     methods = MethodSettings(
         settings.sensor_sigma_m, settings.n_registrations, widen_unknown=False
     )
@@ -120,6 +120,7 @@ def evaluate(
         found,
         model=str(path),
         shape=loaded.shape,
+        n_free=n_free,
         trajectories={
             recording.name: _trajectory(recording, loaded, settings)
             for recording in (recordings if settings.n_trajectories else ())
@@ -184,8 +185,13 @@ def _recordings(
     return list(found.values())
 
 
-def _answered(datasets: Sequence[Dataset], names: Sequence[str]) -> tuple[Examples, list[Key]]:
-    """Return the accepted pairs without a free direction, which has no answer, and their keys."""
+def _answered(
+    datasets: Sequence[Dataset], names: Sequence[str]
+) -> tuple[Examples, list[Key], int]:
+    """Return the accepted pairs, their keys, and how many others have a free direction.
+
+    The node gives no answer to those.
+    """
     examples, wanted = load_examples(datasets, names), set(names)
     keys = sorted(
         key
@@ -196,7 +202,8 @@ def _answered(datasets: Sequence[Dataset], names: Sequence[str]) -> tuple[Exampl
     kept = are_held(examples)
     if not kept.any():
         raise DatasetError(f"{datasets[0].path}: in every pair no plane holds some direction")
-    return select(examples, kept), [key for key, keep in zip(keys, kept, strict=True) if keep]
+    held = [key for key, keep in zip(keys, kept, strict=True) if keep]
+    return select(examples, kept), held, len(keys) - len(held)
 
 
 def _add_online(

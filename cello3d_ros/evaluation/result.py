@@ -169,7 +169,8 @@ class Evaluation:
     model, shape: its file or name, and what its covariances are relative to; settings: what
     methods assumed.  n_pairs, methods: all recordings together, without the pairs whose poses are
     suspected; with_flagged_pairs: with them, where there are any.  pairs: all of them, flagged or
-    not; worst_pairs: those that the model misses most, the worst first.
+    not; worst_pairs: those that the model misses most, the worst first.  n_free: pairs with a free
+    direction, which have no answer online and are in no figure.
     """
 
     model: str
@@ -184,6 +185,7 @@ class Evaluation:
     pairs: list[Pair]
     worst_pairs: list[ShownPair]
     trajectories: dict[str, Trajectory] = field(default_factory=dict)
+    n_free: int = 0
 
 
 def write_evaluation(evaluation: Evaluation, path: Path) -> None:

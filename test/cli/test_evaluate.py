@@ -133,8 +133,9 @@ def test_pairs_with_a_free_direction_have_no_answer_to_judge(
         tunnel.features[FEATURES.index("log_held")] = 0.0 if i else 5.0
         dataset.write(tunnel)
     assert evaluate(folder, "--only", "tunnel", "--json", folder / "e.json") == 0
-    assert json.loads((folder / "e.json").read_text())["n_pairs"] == 1
-    capsys.readouterr()
+    report = json.loads((folder / "e.json").read_text())
+    assert (report["n_pairs"], report["n_free"]) == (1, 2)
+    assert "2 pairs are left out: no plane holds some direction" in capsys.readouterr().out
     tunnel = record("cave", 0)
     tunnel.features[FEATURES.index("log_held")] = 0.0
     dataset.write(tunnel)
