@@ -41,7 +41,7 @@ def read_fields(message: Any, names: tuple[str, ...]) -> dict[str, NDArray[Any]]
             raise CloudError(f"PointCloud2 field {axis!r} is {dtype[axis]}, expected a float")
     records = _records(message, dtype)
     finite = np.isfinite(records["x"]) & np.isfinite(records["y"]) & np.isfinite(records["z"])
-    kept = records[finite]
+    kept = records if finite.all() else records[finite]
     return {name: kept[name].astype(dtype[name].newbyteorder("=")) for name in names}
 
 

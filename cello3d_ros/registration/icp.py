@@ -119,7 +119,8 @@ def _register(
     """
     if len(tree.points) < config.n_neighbors:
         return _too_few(T_init)
-    T, mean = np.array(T_init, np.float64, order="C"), tree.points.mean(axis=0)
+    T = np.array(T_init, np.float64, order="C")
+    mean = np.einsum("ij->j", tree.points) / len(tree.points)  # faster than numpy's mean
     start, motion = begin(T, reading, mean), np.eye(4)  # about the mean
     moved, queries = np.empty_like(start), np.empty_like(start)
     steps: list[tuple[float, float]] = []  # rotation and translation
