@@ -6,7 +6,7 @@ import functools
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import TypeVar
 
 P = TypeVar("P")
@@ -18,11 +18,18 @@ _here = threading.local()
 def in_threads(task: Callable[[P], T], parts: Sequence[P], n_threads: int) -> list[T]:
     """Return what ``task`` makes of each part, in threads if there are more than one of both.
 
-    The threads stay for the next call.  A task that shares its work does all of it itself.
+    The threads stay for the next call.  A task that shares its work does all of it itself.  When
+    one raises, those that wait are dropped and those that run are waited for.
     """
     if min(n_threads, len(parts)) <= 1 or hasattr(_here, "is_busy"):
         return [task(part) for part in parts]
-    return list(_pool(n_threads).map(task, parts))
+    futures = [_pool(n_threads).submit(task, part) for part in parts]
+    try:
+        return [future.result() for future in futures]
+    finally:
+        for future in futures:
+            future.cancel()
+        wait(futures)
 
 
 @functools.cache

@@ -37,6 +37,24 @@ def test_an_error_of_a_task_is_the_callers():
         in_threads(lambda k: 1 // k, range(3), 2)
 
 
+def test_when_a_task_raises_no_other_runs_on():
+    another, done, both = threading.Event(), [], threading.Barrier(2)
+
+    def task(k):
+        if k == 0:
+            another.wait(30.0)
+            raise ZeroDivisionError
+        another.set()
+        sum(range(300_000))
+        done.append(k)
+
+    with pytest.raises(ZeroDivisionError):
+        in_threads(task, range(1000), 2)
+    n = len(done)
+    in_threads(lambda _: both.wait(30.0), range(2), 2)
+    assert 0 < len(done) == n < 999
+
+
 def _sum_in_threads(queue):
     queue.put(sum(in_threads(lambda k: k, range(10), 2)))
 
