@@ -45,8 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"cello3d: {error}", file=sys.stderr)
         return 1
     except (KeyboardInterrupt, SystemError) as error:
-        if isinstance(error, SystemError) and not isinstance(error.__cause__, KeyboardInterrupt):
-            raise  # else: Ctrl-C while a compiled function took its arguments
+        if not _is_interrupt(error):
+            raise
         print("cello3d: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output left, as `head` does
@@ -61,6 +61,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         else:
             raise
         return 1
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Say whether an error came of Ctrl-C.
+
+    A compiled function that is interrupted while it takes its arguments raises SystemError, as
+    often as such functions are nested; the interrupt is the first cause.
+    """
+    while isinstance(error, SystemError):
+        error = error.__cause__
+    return isinstance(error, KeyboardInterrupt)
 
 
 def _forget_output() -> None:

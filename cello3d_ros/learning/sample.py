@@ -67,13 +67,8 @@ def sample(
     ) -> Iterator[PairRecord]:
         return sample_recording(recording, todo, pipeline, sampling, n_threads, progress)
 
-    try:
-        with threadpool_limits(1, user_api="blas"):  # its threads take the kernels' cores
-            return _sample(opened, dataset, sampler or here, n_threads, report)
-    except SystemError as error:  # what CPython makes of Ctrl-C in a compiled kernel
-        if isinstance(error.__cause__, KeyboardInterrupt):
-            raise error.__cause__ from None
-        raise
+    with threadpool_limits(1, user_api="blas"):  # its threads take the kernels' cores
+        return _sample(opened, dataset, sampler or here, n_threads, report)
 
 
 def _opened(paths: Sequence[Path | str | Recording], rescan: bool) -> dict[str, Recording]:

@@ -144,11 +144,14 @@ def test_ctrl_c_is_130_and_one_line(monkeypatch, capsys):
 
 
 def test_an_interrupt_within_a_compiled_function_is_an_interrupt(monkeypatch, capsys):
-    """The interpreter then raises a SystemError whose cause is the interrupt."""
+    """The interpreter raises a SystemError for it, and another where it passes a second one."""
     from cello3d_ros.cli import info
 
     def interrupted(_):
-        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+        try:
+            raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+        except SystemError as error:
+            raise SystemError("returned a result with an exception set") from error
 
     monkeypatch.setattr(info, "run", interrupted)
     assert main(["info", "general"]) == 130
