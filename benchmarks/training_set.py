@@ -20,14 +20,14 @@ from cello3d_ros.config import Config, SamplingConfig
 from cello3d_ros.learning.sample import sample
 from cello3d_ros.recordings.recording import Scan
 from cello3d_ros.simulation.drives import Drive
-from cello3d_ros.simulation.products import SCANNERS
+from cello3d_ros.simulation.products import SCANNERS, calibrated
 from cello3d_ros.simulation.scanner import Scanner
 from cello3d_ros.simulation.simulation import Simulation
 
 FIRST_SEED = {"train": 1000, "test": 5000}
 SAMPLING = {
-    "train": SamplingConfig(n_samples=60, n_views=10, max_gap=2, n_rotations=1),
-    "test": SamplingConfig(n_samples=60, n_views=15, max_gap=2, n_rotations=1),
+    "train": SamplingConfig(n_samples=50, n_views=10, variance=0.0025, max_gap=2, n_rotations=1),
+    "test": SamplingConfig(n_samples=60, n_views=15, variance=0.0025, max_gap=2, n_rotations=1),
 }
 N_SCANS = 3
 N_DRIVES = {"train": 24, "test": 6}  # of each world
@@ -136,13 +136,15 @@ def driven(world: str, seed: int) -> Simulation:
         body=bool(rng.uniform() < 0.3),
     )
     title = f"{world}-{name}-{motion}-{seed}"
-    return Kept(world, seed, N_SCANS, SOLD[name], title=title, drive=drive)
+    scanner = calibrated(SOLD[name], rng)
+    return Kept(world, seed, N_SCANS, scanner, title=title, drive=drive)
 
 
 def walked(world: str, seed: int) -> Simulation:
     """Return a walk through a world of the paper's kinds, in steps of 0.4 to 0.9 m."""
     name = OF_WALKS[(seed + WALKED.index(world)) % len(OF_WALKS)]
-    return Kept(world, seed, N_SCANS, SCANNERS[name], title=f"{world}-{name}-walk-{seed}")
+    scanner = calibrated(SCANNERS[name], np.random.default_rng([seed, WALKED.index(world)]))
+    return Kept(world, seed, N_SCANS, scanner, title=f"{world}-{name}-walk-{seed}")
 
 
 def main() -> None:

@@ -6,6 +6,7 @@ Source: the sampled covariances of Bengtsson & Baerveldt 2003 and Iversen et al.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,15 +78,20 @@ def seen_from(
     pair, T_world: how to scan and the poses (4, 4), of the reading and of the reference.  Both are
     carried along by ``T_reading exp(e)``, e ~ N(0, diag(0.1^2 I m^2, 0.035^2 I rad^2)): the beams
     fall elsewhere on the same surfaces, so that the bias of ICP is another draw while T_ref_read
-    stays.  Noise and filters are of this view.  Raises CloudError.
+    stays.  Noise and filters are of this view, and so is the scanner: another individual of its
+    kind, with other errors of its beams.  Raises CloudError.
     """
     T_read, T_ref = T_world
     moved = T_read @ exp(rng.normal(size=6) * np.repeat([_VIEW_M, _VIEW_RAD], 3))
     poses = moved, moved @ inverse(T_read) @ T_ref
-    P, Q = (
-        prepare(measure(look(T), rng), pipeline.cloud, rng)
-        for look, T in zip(pair, poses, strict=True)
-    )
+    serial = int(rng.integers(2**31))
+
+    def scanned(look: Look, T: Array) -> Cloud:
+        echoes = look(T)
+        scanner = replace(echoes.scanner, serial=serial)
+        return prepare(measure(echoes._replace(scanner=scanner), rng), pipeline.cloud, rng)
+
+    P, Q = (scanned(look, T) for look, T in zip(pair, poses, strict=True))
     return P, Q
 
 

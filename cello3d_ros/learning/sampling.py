@@ -281,7 +281,10 @@ def _from_views(
     seeds: list[list[int]],
     n_threads: int,
 ) -> list[Registration]:
-    """Register from many starts, number k in view k modulo ``n_views``."""
+    """Register from many starts, number k in view k modulo ``n_views``.
+
+    Those that end where a direction is free have no answer, as online.
+    """
     assert pair.reading.look is not None
     assert pair.reference.look is not None
     looks = pair.reading.look, pair.reference.look
@@ -300,13 +303,23 @@ def _from_views(
         except CloudError:
             return
         own = [seeds[row] for row in rows]
-        for row, result in zip(
-            rows, register_many(P, Q, T_inits[rows], own, pipeline.icp), strict=True
-        ):
-            found[row] = result
+        results = register_many(P, Q, T_inits[rows], own, pipeline.icp)
+        for row, result in zip(rows, results, strict=True):
+            if _is_held(P, Q, result, pipeline):
+                found[row] = result
 
     in_threads(one, range(len(views)), n_threads)
     return found
+
+
+def _is_held(reading: Cloud, reference: Cloud, result: Registration, pipeline: Pipeline) -> bool:
+    """Return whether planes hold a registration in every direction, where it has an answer."""
+    if not result.has_answer:
+        return False
+    try:
+        return not describe(reading, reference, result.T_ref_read, pipeline, 0).free
+    except RegistrationError:
+        return False
 
 
 def finish_pair(

@@ -126,3 +126,21 @@ SCANNERS = MappingProxyType(
         ),
     }
 )  # fmt: skip
+
+
+def calibrated(scanner: Scanner, rng: np.random.Generator) -> Scanner:
+    """Return an individual of a scanner, with the errors that calibration leaves in its beams.
+
+    As large as the planes that real scanners see tell them to be (``docs/simulation.md``).
+    """
+    factor = float(np.exp(rng.normal(0.0, _SPREAD)))
+    return replace(
+        scanner,
+        range_offset_m=factor * _OFFSET_M,
+        elevation_error_deg=factor * _ELEVATION_DEG,
+        serial=int(rng.integers(2**31)),
+    )
+
+
+_OFFSET_M, _ELEVATION_DEG = 0.008, 0.02  # of the beams of a scanner, its geometric mean
+_SPREAD = 0.6  # of its logarithm, between scanners

@@ -30,6 +30,8 @@ class Scanner:
     sweep_s: duration of a scan.  Azimuth (a tilting fan: elevation) grows with time.
     range_noise_m, range_noise_per_m: standard deviation of a range near the sensor, and what is
     added to it, in quadrature, per metre of range.
+    range_offset_m, elevation_error_deg: standard deviations of the constant errors of each beam's
+    range and elevation, which calibration leaves.  serial: the individual that has drawn them.
     missing_share: share of the returns that get lost whatever they hit.
     grazing_deg: angle of incidence (0 is head-on) beyond which the chance of a return falls,
     linearly in the cosine, to 0 at 90 degrees.
@@ -54,6 +56,9 @@ class Scanner:
     max_range_m: float = 30.0
     range_noise_m: float = 0.01
     range_noise_per_m: float = 0.0
+    range_offset_m: float = 0.0
+    elevation_error_deg: float = 0.0
+    serial: int = 0
     missing_share: float = 0.03
     grazing_deg: float = 80.0
     reach_m: float = np.inf
@@ -78,6 +83,9 @@ class Scanner:
             "max_range_m": self.max_range_m <= 10_000,
             "range_noise_m": 0 <= self.range_noise_m <= 10,
             "range_noise_per_m": 0 <= self.range_noise_per_m <= 1,
+            "range_offset_m": 0 <= self.range_offset_m <= 10,
+            "elevation_error_deg": 0 <= self.elevation_error_deg <= 10,
+            "serial": self.serial >= 0,
             "missing_share": 0 <= self.missing_share <= 1,
             "grazing_deg": 0 <= self.grazing_deg < 90,
             "reach_m": self.reach_m > 0,
@@ -180,8 +188,9 @@ class Echoes(NamedTuple):
 def measure(echoes: Echoes, rng: np.random.Generator, range_noise_m: float | None = None) -> Array:
     """Return the points (N, 3) of one scan in the sensor frame, each a float32 number.
 
-    A range is the distance along the beam plus Gaussian noise; ``range_noise_m`` stands in for the
-    scanner's own.  A range outside the scanner's limits, a grazing, dark or randomly missing
+    A range is the distance along the beam, the offset of the beam and Gaussian noise;
+    ``range_noise_m`` stands in for the scanner's own.  A point lies where the scanner believes its
+    beam to go.  A range outside the scanner's limits, a grazing, dark or randomly missing
     return gives no point.
     """
     return returns(echoes, rng, range_noise_m)[0]
@@ -213,6 +222,11 @@ def returns(
     if scanner.range_noise_per_m > 0.0:
         seen = np.where(np.isfinite(distance), distance, 0.0)
         noise = np.hypot(sigma_m, scanner.range_noise_per_m * seen) * unit
+    offset, elevation = _errors_of_beams(scanner)
+    if scanner.range_offset_m > 0.0:
+        noise = noise + offset
+    if scanner.elevation_error_deg > 0.0:
+        beams = _raised(beams, elevation)
     kept = (
         (distance + noise >= scanner.min_range_m)
         & (distance + noise <= scanner.max_range_m)
@@ -221,6 +235,25 @@ def returns(
     )
     points = (distance[kept] + noise[kept])[:, None] * beams[kept]
     return np.asarray(points.astype(np.float32), dtype=np.float64), np.flatnonzero(kept)
+
+
+def _errors_of_beams(scanner: Scanner) -> tuple[Array, Array]:
+    """Return the constant errors of the range (m) and elevation (rad) of each direction (n,).
+
+    A row of directions is one beam; all of a nodding fan are.
+    """
+    rows, columns = scanner.shape
+    rng = np.random.default_rng(scanner.serial)
+    units = rng.normal(size=(2, 1 if scanner.pattern == "tilting" else rows))
+    offset, elevation = np.repeat(np.broadcast_to(units, (2, rows)), columns, axis=1)
+    return scanner.range_offset_m * offset, np.radians(scanner.elevation_error_deg) * elevation
+
+
+def _raised(beams: Array, angle: Array) -> Array:
+    """Return unit vectors (n, 3) turned up by small angles (n,) in rad."""
+    z = beams[:, 2:]
+    up = (np.array([0.0, 0.0, 1.0]) - z * beams) / np.sqrt(np.maximum(1.0 - z**2, 1e-12))
+    return np.asarray(np.cos(angle)[:, None] * beams + np.sin(angle)[:, None] * up)
 
 
 def _mixed(scanner: Scanner, distance: Array, beams: Array, rng: np.random.Generator) -> Array:

@@ -1,4 +1,5 @@
 import dataclasses
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -439,6 +440,22 @@ def test_another_view_keeps_the_motion_and_sees_other_points():
         assert np.abs(log(inverse(T) @ found.T_ref_read)[:2]).max() < 0.02
     spread = np.linalg.norm(views[0][0].points.mean(axis=0) - views[1][0].points.mean(axis=0))
     assert spread > 0.01
+
+
+def test_both_scans_of_a_view_are_of_one_scanner_and_another_view_of_another():
+    """A wall that is the same from everywhere, without noise: only the beams' errors differ."""
+    scanner = dataclasses.replace(SCANNERS["spinning16"], range_noise_m=0.0, range_offset_m=0.1)
+    n = scanner.shape[0] * scanner.shape[1]
+    look = partial(Echoes, scanner, np.full(n, 5.0), np.ones(n))
+    pair, T_world = (lambda _: look(), lambda _: look()), (np.eye(4), np.eye(4))
+    first, second = (
+        [np.unique(np.linalg.norm(cloud.points, axis=1).round(4)) for cloud in view]
+        for view in (
+            seen_from(pair, T_world, PIPELINE, np.random.default_rng(k)) for k in range(2)
+        )
+    )
+    assert np.intersect1d(*first).size > 8
+    assert np.intersect1d(first[0], second[0]).size < 2
 
 
 def test_registrations_from_several_views_are_the_same_for_any_blocks_and_threads():

@@ -138,3 +138,39 @@ def test_a_scanner_without_new_errors_draws_what_it_always_drew() -> None:
     assert np.array_equal(beams, np.flatnonzero(kept))
     expected = (5.0 + noise)[kept, None] * scanner.directions()[kept]
     assert np.array_equal(points, expected.astype(np.float32).astype(float))
+
+
+OFF = Scanner(
+    n_beams=8, range_offset_m=0.02, elevation_error_deg=0.5, missing_share=0.0, grazing_deg=0.0
+)
+
+
+def seen(scanner: Scanner, seed: int = 0) -> np.ndarray:
+    """Return the points (rows, columns, 3) of a sphere of 10 m, without noise."""
+    points = measure(echoes(scanner, 10.0), np.random.default_rng(seed), 0.0)
+    return points.reshape(*scanner.shape, 3)
+
+
+def test_each_beam_has_a_range_and_an_elevation_of_its_own_in_all_scans() -> None:
+    points = seen(OFF)
+    np.testing.assert_array_equal(points, seen(OFF, seed=1))
+    offset = np.linalg.norm(points, axis=2) - 10.0
+    error = np.degrees(np.arcsin(points[..., 2] / (10.0 + offset))) - OFF.elevations()[:, None]
+    for each, sigma in ((offset, 0.02), (error, 0.5)):
+        np.testing.assert_allclose(each, each[:, :1] * np.ones_like(each), rtol=0, atol=1e-5)
+        assert 0.3 * sigma < each[:, 0].std() < 2.0 * sigma
+
+
+def test_errors_of_beams_have_the_stated_deviation_and_no_mean() -> None:
+    many = replace(OFF, n_beams=2000, n_columns=1)
+    offset = np.linalg.norm(seen(many)[:, 0], axis=1) - 10.0
+    assert abs(offset.mean()) < 3 * 0.02 / np.sqrt(2000)
+    assert offset.std() == pytest.approx(0.02, rel=0.05)
+
+
+def test_another_individual_has_other_errors_and_a_nodding_fan_is_one_beam() -> None:
+    assert np.abs(seen(OFF) - seen(replace(OFF, serial=1))).max() > 0.01
+    fan = replace(OFF, pattern="tilting", azimuth_span_deg=270.0)
+    ranges = np.linalg.norm(seen(fan), axis=2)
+    assert np.ptp(ranges) < 1e-5
+    assert abs(ranges[0, 0] - 10.0) > 1e-4
