@@ -38,7 +38,7 @@ from cello3d_ros.covariance.heading import FRAMES, blended, out_of_motion
 from cello3d_ros.covariance.lost import Lost
 from cello3d_ros.covariance.sums import pack, squared_distances, unpack, weighted_sum
 from cello3d_ros.errors import ConfigError, ModelError
-from cello3d_ros.geometry.gaussian import is_positive_definite, matrix_sqrt, symmetrized
+from cello3d_ros.geometry.gaussian import Bias, is_positive_definite, matrix_sqrt, symmetrized
 from cello3d_ros.geometry.se3 import Array
 
 FORMAT = "cello3d-model"
@@ -77,6 +77,7 @@ class Model:
     rotations_rad: (R,), the turns about z of each training pair, side by side in the examples.
     training_mean: (6, 6), mean of the absolute training covariances; or (0, 6), not known.
     lost: how to tell a registration that ended in another minimum; None where nothing is known.
+    bias: what the errors of registrations that follow each other have in common.
     provenance: recordings, seeds, versions, settings, figures; anything that JSON can hold.
     Raises ModelError naming what does not fit.  The arrays are read-only.
     """
@@ -96,6 +97,7 @@ class Model:
     mean_weight: float = 0.0
     margin: float = 1.0
     lost: Lost | None = None
+    bias: Bias = field(default_factory=Bias)
     pipeline: Pipeline = field(default_factory=Pipeline)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -110,6 +112,7 @@ class Model:
             object.__setattr__(self, name, _number(name, getattr(self, name)))
         if self.lost is not None:
             object.__setattr__(self, "lost", _checked(self.lost))
+        object.__setattr__(self, "bias", _checked_bias(self.bias))
         for start in range(0, len(self.covariances), _BLOCK):
             fine = is_positive_definite(self.covariances[start : start + _BLOCK])
             if not fine.all():
@@ -270,6 +273,7 @@ def load_model(name: Path | str = "general") -> Model:
             mean_weight=header["mean_weight"],
             margin=header["margin"],
             lost=_lost_from(header.get("lost")),
+            bias=_bias_from(header.get("bias")),
             pipeline=pipeline_of(config),
             sampling=config.sampling,
             provenance=header["provenance"],
@@ -309,6 +313,7 @@ def _header(model: Model) -> dict[str, Any]:
         "mean_weight": model.mean_weight,
         "margin": model.margin,
         "lost": None if model.lost is None else _lost_to(model.lost),
+        "bias": model.bias._asdict(),
         "provenance": model.provenance,
     }
 
@@ -333,6 +338,15 @@ def _lost_from(item: object) -> Lost | None:
     if not isinstance(item, dict) or set(item) != {"limit_m", "covariance"}:
         raise ModelError(f"item 'lost' is not a limit_m and a covariance: {item!r}")
     return Lost(**item)
+
+
+def _bias_from(item: object) -> Bias:
+    """Return what the header holds; models made before it was measured have the default."""
+    if item is None:
+        return Bias()
+    if not isinstance(item, dict) or set(item) != set(Bias._fields):
+        raise ModelError(f"item 'bias' is not a share and a way_m: {item!r}")
+    return Bias(**item)
 
 
 def _read_header(path: Path | str) -> dict[str, Any]:
@@ -362,7 +376,7 @@ def _read_header(path: Path | str) -> dict[str, Any]:
 def _check_items(found: Mapping[str, Any], wanted: Mapping[str, Any], where: str) -> None:
     """Raise ModelError for a missing item; settings within a section may be missing."""
     for name in wanted:
-        if name not in found and name != "lost":
+        if name not in found and name not in ("lost", "bias"):
             raise ModelError(f"{where}: item {name!r} is missing")
     if not isinstance(found["config"], dict):
         raise ModelError(f"{where}: item 'config' holds no sections")
@@ -484,6 +498,16 @@ def _checked(lost: Lost) -> Lost:
     if covariance.shape != (6, 6) or not is_positive_definite(covariance):
         raise ModelError("lost.covariance is not a positive definite 6x6 matrix")
     return Lost(limit_m, covariance)
+
+
+def _checked_bias(bias: Bias) -> Bias:
+    """Return the bias as numbers, or raise ModelError."""
+    share, way_m = _number("bias.share", bias.share), _number("bias.way_m", bias.way_m)
+    if not 0.0 <= share <= 1.0:
+        raise ModelError(f"bias.share must be in [0, 1]: {share!r}")
+    if not 0.0 < way_m < math.inf:
+        raise ModelError(f"bias.way_m must be positive and finite: {way_m!r}")
+    return Bias(share, way_m)
 
 
 def _number(name: str, value: object) -> float:

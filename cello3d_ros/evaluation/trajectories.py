@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -17,9 +17,10 @@ from cello3d_ros.covariance.model import Model
 from cello3d_ros.errors import RegistrationError
 from cello3d_ros.evaluation.result import Consistency, Distances, Paths
 from cello3d_ros.geometry.gaussian import (
+    INDEPENDENT,
+    Bias,
     Chained,
     GaussianPose,
-    bias_kept,
     extended,
     mahalanobis,
 )
@@ -71,7 +72,7 @@ def odometry_runs(
     are compounded with the bias that neighbouring steps share.
     """
     runs = _runs(clouds, T_world_sensor, [model], n_runs, seed, n_threads)
-    return _stacked(runs, 0, T_world_sensor, compound_path)
+    return _stacked(runs, 0, T_world_sensor, model.bias)
 
 
 def runs_of_models(
@@ -85,13 +86,11 @@ def runs_of_models(
     """Return the same runs judged by each of some models that have one pipeline.
 
     Starts scatter as in the sampling of the first.  Steps of a model of absolute covariances are
-    compounded as independent ones, as in the paper; others with the bias that neighbours share.
+    compounded as independent ones, as in the paper; others with the bias of the model.
     """
     runs = _runs(clouds, T_world_sensor, models, n_runs, seed, n_threads)
     return [
-        _stacked(
-            runs, k, T_world_sensor, independent_path if model.shape == "none" else compound_path
-        )
+        _stacked(runs, k, T_world_sensor, INDEPENDENT if model.shape == "none" else model.bias)
         for k, model in enumerate(models)
     ]
 
@@ -119,11 +118,11 @@ def _stacked(
     runs: Sequence[list[_Run] | None],
     k: int,
     T_world_sensor: Array,
-    compound: Callable[[Sequence[GaussianPose]], list[GaussianPose]],
+    bias: Bias,
 ) -> Runs:
     """Return what the k-th model makes of the runs."""
     reached = [run[k] for run in runs if run is not None]
-    paths = tuple(compound(run.steps) for run in reached)
+    paths = tuple(compound_path(run.steps, bias) for run in reached)
     T_true = inverse(T_world_sensor[0]) @ T_world_sensor[-1]
     xi = log(inverse(T_true) @ np.array([path[-1].T for path in paths]).reshape(-1, 4, 4))
     Y = np.array([path[-1].Y for path in paths]).reshape(-1, 6, 6)
@@ -132,20 +131,11 @@ def _stacked(
     return Runs(xi, Y, lost, told, len(runs) - len(reached), paths)
 
 
-def compound_path(steps: Sequence[GaussianPose]) -> list[GaussianPose]:
-    """Return the pose after each step, right covariance, with the bias that neighbours share."""
-    return _path(steps, [bias_kept(step.T) for step in steps])
-
-
-def independent_path(steps: Sequence[GaussianPose]) -> list[GaussianPose]:
-    """Return the pose after each step, right covariance, of steps that share nothing."""
-    return _path(steps, [0.0] * len(steps))
-
-
-def _path(steps: Sequence[GaussianPose], kept: Sequence[float]) -> list[GaussianPose]:
+def compound_path(steps: Sequence[GaussianPose], bias: Bias = INDEPENDENT) -> list[GaussianPose]:
+    """Return the pose after each step, right covariance, with the bias that steps share."""
     chain, path = Chained.start(np.eye(4)), []
-    for step, phi in zip(steps, kept, strict=True):
-        chain = extended(chain, step, phi)
+    for step in steps:
+        chain = extended(chain, step, bias)
         path.append(chain.pose)
     return path
 

@@ -18,9 +18,8 @@ from cello3d_ros.geometry.se3 import Array, adjoint, inverse, log
 _MARGIN = 1e-14  # smallest eigenvalue of a correlation matrix that rounding cannot have made
 _CONDITION = 1e-13  # least ratio of eigenvalues that still is positive definite when rounded
 _UNKNOWN = 1e12  # variance (m^2, rad^2) beyond which a chain does not grow
-BIAS_SHARE = 0.15  # of the variance of a registration, that neighboring ones have in common
 REFERENCE_SHARE = 0.4  # of the variance of registrations, that those to one reference share
-_BIAS_M, _BIAS_RAD = 1.0, 0.35  # motion over which that falls by a factor e
+_RAD_PER_M = 0.35  # a turn that tells two registrations apart as a metre of way does
 _ASYMMETRY = 1e-9  # largest difference of mirrored correlations that rounding can have made
 
 
@@ -29,6 +28,41 @@ class GaussianPose(NamedTuple):
 
     T: Array
     Y: Array
+
+
+class Bias(NamedTuple):
+    """What the errors of registrations that follow each other have in common.
+
+    share: of their variance.  way_m: motion over which that falls by a factor e.
+    """
+
+    share: float = 0.15
+    way_m: float = 1.0
+
+    def kept(self, T_step: ArrayLike) -> float:
+        """Return phi, how much of the bias of one registration is left in the next.
+
+        ``exp(-(way + angle 1 m / 0.35 rad) / way_m)`` of the motion between the two: what is near
+        sees the same surfaces in the same way.  T_step: (4, 4).
+        """
+        return float(np.exp(-motion_m(T_step) / self.way_m))
+
+    def inflation(self, T_step: ArrayLike) -> float:
+        """Return by how much the variance of a sum of steps exceeds that of independent ones.
+
+        ``1 + 2 s phi / (1 - phi)``, of many steps like this one, which follow ``extended``.
+        """
+        phi = self.kept(T_step)
+        return 1.0 + 2.0 * self.share * phi / (1.0 - phi)
+
+
+INDEPENDENT = Bias(share=0.0)
+
+
+def motion_m(T: ArrayLike) -> float:
+    """Return the way of a motion (4, 4) in metres, of which 0.35 rad of a turn is one."""
+    u, omega = np.split(log(T), 2)
+    return float(np.linalg.norm(u) + np.linalg.norm(omega) / _RAD_PER_M)
 
 
 class Chained(NamedTuple):
@@ -139,39 +173,21 @@ def between(first: GaussianPose, second: GaussianPose, common: float = 0.0) -> G
     return GaussianPose(inverse(first.T) @ second.T, symmetrized(Y))
 
 
-def inflation(kept: float) -> float:
-    """Return by how much the variance of a sum of steps exceeds that of independent ones.
-
-    ``1 + 2 s kept / (1 - kept)``, of many steps whose biases follow ``extended``.
-    """
-    return 1.0 + 2.0 * BIAS_SHARE * kept / (1.0 - kept)
-
-
-def bias_kept(T_step: ArrayLike) -> float:
-    """Return phi, how much of the bias of one registration is left in the next.
-
-    ``exp(-(way / 1 m + angle / 0.35 rad))`` of the motion between the two: what is near sees the
-    same surfaces in the same way.  T_step: (4, 4).
-    """
-    u, omega = np.split(log(T_step), 2)
-    return float(np.exp(-np.linalg.norm(u) / _BIAS_M - np.linalg.norm(omega) / _BIAS_RAD))
-
-
-def extended(chain: Chained, step: GaussianPose, kept: float = 0.0) -> Chained:
+def extended(chain: Chained, step: GaussianPose, bias: Bias = INDEPENDENT) -> Chained:
     """Return a chain of poses that is one step longer, right covariances, as ``compound_right``.
 
-    The error of a step is ``L (sqrt(s) b + sqrt(1 - s) n)``, ``L L^T`` its covariance, n noise
-    that is new, b a bias that goes on from step to step: ``b_next = kept b + w``, a Gauss-Markov
-    process of unit variance.  What the chain shares with it is added to first order; 0 is
-    independent steps.
+    The error of a step is ``L (sqrt(s) b + sqrt(1 - s) n)``, ``L L^T`` its covariance, s the share
+    of the bias, n noise that is new, b a bias that goes on from step to step: ``b_next = phi b +
+    w``, a Gauss-Markov process of unit variance.  What the chain shares with it is added to first
+    order.
 
     Of 4th order wherever that is positive definite, else of 2nd.  By simulation of 80 steps of
     0.5 m it is right to 2 % while the rotation of the chain is known to a radian, and too wide
     beyond; the 2nd order alone is far too small then, where a robot moves.  Variances stay below
     1e12, where nothing is known any more.
     """
-    Ad, root = adjoint(inverse(step.T)), np.sqrt(BIAS_SHARE) * np.linalg.cholesky(step.Y)
-    before = kept * Ad @ chain.shared
+    Ad, root = adjoint(inverse(step.T)), np.sqrt(bias.share) * np.linalg.cholesky(step.Y)
+    before = bias.kept(step.T) * Ad @ chain.shared
     common = before @ root.T
     common = common + common.T
     T, Y = compound_right(chain.T, chain.Y, *step)

@@ -36,6 +36,7 @@ class Examples:
     after ``select_inputs`` what a model looks at.  global_features: (N, G).  motions: (N, 2), what
     ``motion_of`` finds in the true T_ref_read.
     covariances: (N, 6, 6).  groups: (N,) names of recordings.  shapes: name -> (N, 6, 6).
+    scans: (N, 2), numbers of the reference and of the reading; T_mean: (N, 4, 4), true T_ref_read.
     xi: N arrays (n, 6), some of the errors that made each covariance.  lost_xi: (M, 6), the errors
     of all their registrations that ended in another minimum.
     """
@@ -47,6 +48,8 @@ class Examples:
     shapes: dict[str, Array]
     rotations_rad: Array
     global_features: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
+    scans: NDArray[np.int64] = dataclasses.field(default_factory=lambda: np.zeros((0, 2), int))
+    T_mean: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 4, 4)))
     xi: tuple[Array, ...] = ()
     lost_xi: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 6)))
     rejected: dict[str, int] = dataclasses.field(default_factory=dict)  # reason -> pairs
@@ -252,6 +255,8 @@ def _stacked(records: list[PairRecord], dataset: Dataset) -> Examples:
         groups=np.array([record.recording for record in accepted]),
         shapes={n: np.array([record.shapes[n] for record in accepted]) for n in sorted(names)},
         rotations_rad=first.rotations_rad,
+        scans=np.array([record.key[1:] for record in accepted]),
+        T_mean=np.array([record.T_mean for record in accepted]),
         xi=tuple(record.xi for record in accepted),
         rejected=dict(sorted(Counter(r.reason for r in records if not r.accepted).items())),
         pipeline=dataset.pipeline,

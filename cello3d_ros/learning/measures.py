@@ -185,17 +185,24 @@ def pose_check(xi: Array) -> PoseCheck:
     )
 
 
-def select(examples: Examples, keep: NDArray[np.bool_]) -> Examples:
-    """Return some of the pairs.  keep: (N,)."""
+def select(examples: Examples, keep: NDArray[np.bool_] | NDArray[np.intp]) -> Examples:
+    """Return some of the pairs.  keep: (N,) whether to keep each, or the numbers of some."""
+    rows = np.arange(len(examples.groups))[keep]
+
+    def some(known: NDArray[Any]) -> NDArray[Any]:  # of what is known of all pairs or of none
+        return known[rows] if len(known) else known
+
     return dataclasses.replace(
         examples,
-        features=examples.features[keep],
-        global_features=examples.global_features[keep[: len(examples.global_features)]],
-        motions=examples.motions[keep],
-        covariances=examples.covariances[keep],
-        groups=examples.groups[keep],
-        shapes={name: S[keep] for name, S in examples.shapes.items()},
-        xi=tuple(examples.xi[k] for k in np.flatnonzero(keep)) if examples.xi else (),
+        features=examples.features[rows],
+        global_features=some(examples.global_features),
+        motions=examples.motions[rows],
+        covariances=examples.covariances[rows],
+        groups=examples.groups[rows],
+        shapes={name: S[rows] for name, S in examples.shapes.items()},
+        scans=some(examples.scans),
+        T_mean=some(examples.T_mean),
+        xi=tuple(examples.xi[k] for k in rows) if examples.xi else (),
     )
 
 

@@ -22,6 +22,7 @@ from cello3d_ros.covariance.sums import unpack
 from cello3d_ros.errors import ConfigError, DatasetError, FreeDirectionError
 from cello3d_ros.geometry.gaussian import sampled_covariance
 from cello3d_ros.geometry.se3 import Array
+from cello3d_ros.learning.bias import measured_bias
 from cello3d_ros.learning.dataset import package_versions
 from cello3d_ros.learning.examples import (
     Examples,
@@ -147,6 +148,7 @@ def _model(
         mean_weight=config.mean_weight,
         margin=config.margin,
         lost=None if config.shape == "none" else known_lost(examples, config.frame),
+        bias=measured_bias(examples, config.shape),
         pipeline=examples.pipeline,
         sampling=examples.sampling,
         provenance={

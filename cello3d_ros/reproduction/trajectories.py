@@ -8,7 +8,7 @@ import numpy as np
 
 from cello3d_ros.errors import DatasetError
 from cello3d_ros.evaluation.online import prepared
-from cello3d_ros.evaluation.trajectories import independent_path, runs_of_models
+from cello3d_ros.evaluation.trajectories import compound_path, runs_of_models
 from cello3d_ros.geometry.gaussian import GaussianPose, to_fixed_axes
 from cello3d_ros.geometry.se3 import Array, inverse
 from cello3d_ros.learning.dataset import Dataset
@@ -104,7 +104,7 @@ def _walk(place: Place, found: dict[str, Dataset], key: str) -> _Walk:
     clouds, poses = prepared(recording, dataset.pipeline, scans, workshop.seed)
     T = np.array([poses[k] for k in scans])
     truth = inverse(T[0]) @ T
-    paths = {"sampled": independent_path([GaussianPose(r.T_mean, r.covariance) for r in records])}
+    paths = {"sampled": compound_path([GaussianPose(r.T_mean, r.covariance) for r in records])}
     every = runs_of_models(
         *([clouds[k] for k in scans], T, list(models.values()), _N_RUNS),
         *(workshop.seed, workshop.n_threads),

@@ -24,9 +24,7 @@ from cello3d_ros.geometry.gaussian import (
     Chained,
     GaussianPose,
     between,
-    bias_kept,
     extended,
-    inflation,
 )
 from cello3d_ros.geometry.motion import Motion
 from cello3d_ros.geometry.se3 import Array, inverse, log
@@ -173,7 +171,7 @@ class Tracker:
             self.reset("two scans fit each other but not the first of the chain")
             self._begin(rival)
             found, reference = match, rival
-        pose = extended(reference.pose, found.step, bias_kept(found.step.T))
+        pose = extended(reference.pose, found.step, self.model.bias)
         found = self._with_motion(frame, found, reference)
         self._accept(frame, found, reference, pose)
         return replace(self._published(frame, found, reference, pose.pose), deskewed=deskewed)
@@ -303,7 +301,7 @@ class Tracker:
                 return found
             step = between(before[1], step, REFERENCE_SHARE)
         elif self._pairing.adds_each_step and has_moved(found.estimate):
-            step = GaussianPose(step.T, inflation(bias_kept(step.T)) * step.Y)
+            step = GaussianPose(step.T, self.model.bias.inflation(step.T) * step.Y)
         span_s = 1e-9 * (frame.stamp_ns - newest.frame.stamp_ns)
         if not 0.0 < span_s <= self.config.max_pair_gap_s:
             return found

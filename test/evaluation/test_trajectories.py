@@ -16,7 +16,6 @@ from cello3d_ros.evaluation.trajectories import (
     Runs,
     compound_path,
     consistency,
-    independent_path,
     length_m,
     odometry_runs,
 )
@@ -35,7 +34,7 @@ def test_a_chain_of_true_covariances_is_consistent():
     for T, root in zip(motions, roots, strict=True):
         finals = finals @ T @ exp(rng.normal(size=(n, 6)) @ root.T)
         truth = truth @ T
-    chain = independent_path([GaussianPose(*step) for step in zip(motions, Y, strict=True)])[-1]
+    chain = compound_path([GaussianPose(*step) for step in zip(motions, Y, strict=True)])[-1]
     np.testing.assert_allclose(chain.T, truth, atol=1e-12)
     runs = Runs(
         log(inverse(truth) @ finals),

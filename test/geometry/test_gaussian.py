@@ -8,11 +8,14 @@ import pytest
 from cello3d_ros.geometry import gaussian as g
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import (
+    INDEPENDENT,
+    Bias,
     Chained,
     GaussianPose,
     extended,
     is_positive_definite,
     mahalanobis,
+    motion_m,
 )
 from cello3d_ros.geometry.se3 import Array
 
@@ -427,10 +430,10 @@ def test_a_chain_stays_finite_and_never_knows_more_than_its_steps_together(scale
     assert min(399 * scale, 0.99e12) < chain.Y[0, 0] <= 1.01e12
 
 
-def chained(steps: list[GaussianPose], kept: float) -> Chained:
+def chained(steps: list[GaussianPose], bias: Bias) -> Chained:
     chain = Chained.start(np.eye(4))
     for step in steps:
-        chain = extended(chain, step, kept)
+        chain = extended(chain, step, bias)
     return chain
 
 
@@ -445,62 +448,63 @@ def test_steps_that_keep_no_bias_compound_as_independent_ones() -> None:
     steps = random_steps(12)
     for step in steps:
         T, Y = g.compound_right(T, Y, *step)
-    np.testing.assert_array_equal(chained(steps, 0.0).T, T)
-    np.testing.assert_allclose(chained(steps, 0.0).Y, Y, rtol=0, atol=1e-12)
+    for bias in (INDEPENDENT, Bias(1.0, 1e-6)):  # it shares nothing, and it loses all
+        np.testing.assert_array_equal(chained(steps, bias).T, T)
+        np.testing.assert_allclose(chained(steps, bias).Y, Y, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("n", [2, 10])
-def test_a_bias_that_is_kept_grows_in_proportion_to_the_number_of_steps(monkeypatch, n) -> None:
+def test_a_bias_that_is_kept_grows_in_proportion_to_the_number_of_steps(n) -> None:
     """All of it shared: n times the standard deviation; a share s: n + s n (n - 1) times Y."""
     Y = random_steps(1, 1e-4)[0].Y  # so small that the 4th order adds nothing
     steps = [GaussianPose(np.eye(4), Y)] * n
-    expected = (n + g.BIAS_SHARE * n * (n - 1)) * Y
-    np.testing.assert_allclose(chained(steps, 1.0).Y, expected, rtol=0, atol=1e-4 * Y.max())
-    monkeypatch.setattr(g, "BIAS_SHARE", 1.0)
-    np.testing.assert_allclose(chained(steps, 1.0).Y, n**2 * Y, rtol=0, atol=1e-4 * Y.max())
+    for share in (0.15, 1.0):
+        expected = (n + share * n * (n - 1)) * Y
+        found = chained(steps, Bias(share, 1.0)).Y
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4 * Y.max())
 
 
-@pytest.mark.parametrize("kept", [0.3, 0.9, 1.0])
-def test_a_chain_with_a_bias_covers_sampled_chains(monkeypatch, kept: float) -> None:
+@pytest.mark.parametrize("way_m", [1.0, 10.0, 1e9])
+def test_a_chain_with_a_bias_covers_sampled_chains(way_m: float) -> None:
     """Errors that are drawn as ``extended`` says, over steps that turn; the share is large."""
     share, n = 0.6, 4000
-    monkeypatch.setattr(g, "BIAS_SHARE", share)
     rng, steps = np.random.default_rng(1), random_steps(30, 0.002)
     T_true, T, b = np.eye(4), np.tile(np.eye(4), (n, 1, 1)), rng.normal(size=(n, 6))
     for step in steps:
         z = np.sqrt(share) * b + np.sqrt(1 - share) * rng.normal(size=(n, 6))
         T = T @ step.T @ se3.exp(z @ np.linalg.cholesky(step.Y).T)
         T_true = T_true @ step.T
+        kept = np.exp(-motion_m(step.T) / way_m)
         b = kept * b + np.sqrt(1 - kept**2) * rng.normal(size=(n, 6))
-    chain = chained(steps, kept)
+    chain = chained(steps, Bias(share, way_m))
     d2 = mahalanobis(se3.log(se3.inverse(T_true) @ T), chain.Y) ** 2
     assert np.mean(d2) / 6 == pytest.approx(1.0, abs=0.05)
-    if kept > 0.5:  # and independent steps would not
-        assert (
-            np.mean(mahalanobis(se3.log(se3.inverse(T_true) @ T), chained(steps, 0.0).Y) ** 2) > 9
-        )
+    if way_m > 1.0:  # and independent steps would not
+        d2 = mahalanobis(se3.log(se3.inverse(T_true) @ T), chained(steps, INDEPENDENT).Y) ** 2
+        assert np.mean(d2) > 9
 
 
-def test_a_chain_that_keeps_all_of_its_bias_stays_positive_definite(monkeypatch) -> None:
-    monkeypatch.setattr(g, "BIAS_SHARE", 1.0)
+def test_a_chain_that_keeps_all_of_its_bias_stays_positive_definite() -> None:
     wide = GaussianPose(se3.exp([0.1, 0, 0, 0, 0, 0.5]), np.diag([1.0, 1, 1, 0.5, 0.5, 0.5]))
     chain = Chained.start(np.eye(4))
     for _ in range(100):
-        chain = extended(chain, wide, 1.0)
+        chain = extended(chain, wide, Bias(1.0, 1e9))
         assert is_positive_definite(chain.Y)
 
 
 def test_the_sum_of_many_steps_varies_as_inflated_independent_ones() -> None:
-    Y, n, kept = random_steps(1, 1e-4)[0].Y, 3000, 0.8
-    total = chained([GaussianPose(np.eye(4), Y)] * n, kept).Y
-    np.testing.assert_allclose(total / n, g.inflation(kept) * Y, rtol=0.01, atol=1e-12)
-    assert g.inflation(0.0) == 1.0
+    Y, n, bias = 1e-8 * np.eye(6), 3000, Bias(0.3, 1.0)
+    step = se3.exp([0, 0, 0, 0, 0, 0.1])  # a turn, which does not carry rotation into translation
+    total = chained([GaussianPose(step, Y)] * n, bias).Y
+    np.testing.assert_allclose(total[5, 5] / n, bias.inflation(step) * 1e-8, rtol=0.01)
+    assert INDEPENDENT.inflation(step) == 1.0
 
 
-def test_bias_is_kept_at_rest_and_lost_over_a_long_way_or_a_turn() -> None:
-    assert g.bias_kept(np.eye(4)) == 1.0
-    assert g.bias_kept(se3.exp([5.0, 0, 0, 0, 0, 0])) < 1e-2
-    assert g.bias_kept(se3.exp([0, 0, 0, 0, 0, 3.0])) < 1e-2
+def test_bias_is_kept_at_rest_and_lost_over_a_way_or_a_turn() -> None:
+    bias = Bias(way_m=2.0)
+    assert bias.kept(np.eye(4)) == 1.0
+    assert bias.kept(se3.exp([2.0, 0, 0, 0, 0, 0])) == pytest.approx(np.exp(-1.0))
+    assert bias.kept(se3.exp([0, 0, 0, 0, 0, 0.7])) == pytest.approx(np.exp(-1.0))
 
 
 @pytest.mark.parametrize("common", [0.0, 0.4, 1.0])

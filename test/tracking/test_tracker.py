@@ -20,12 +20,11 @@ from cello3d_ros.errors import (
 from cello3d_ros.geometry import se3
 from cello3d_ros.geometry.gaussian import (
     REFERENCE_SHARE,
+    Bias,
     Chained,
     GaussianPose,
     between,
-    bias_kept,
     extended,
-    inflation,
     is_positive_definite,
 )
 from cello3d_ros.registration.icp import Registration
@@ -99,7 +98,7 @@ def test_chain_starts_at_the_odometry_and_compounds_what_neighbors_share(tracker
     for i in range(3, 7):
         answer = tracker.step(i * S, POINTS, Place(POSES[i]))
         T_step = se3.inverse(POSES[i - 1]) @ POSES[i]
-        chain = extended(chain, GaussianPose(T_step, WIDE), bias_kept(T_step))
+        chain = extended(chain, GaussianPose(T_step, WIDE), Bias())
         np.testing.assert_allclose(answer.pose.T, chain.T, atol=1e-12)
         np.testing.assert_allclose(answer.pose.Y, chain.Y, atol=1e-12)
 
@@ -319,7 +318,7 @@ def test_covariance_accumulates_only_from_keyframe_to_keyframe(asked) -> None:
         np.testing.assert_allclose(answer.pose.Y, WIDE, atol=1e-12)
     expected = Chained.start(np.eye(4))
     for way_m in (1.2, 0.8):
-        expected = extended(expected, GaussianPose(shift(way_m), WIDE), bias_kept(shift(way_m)))
+        expected = extended(expected, GaussianPose(shift(way_m), WIDE), Bias())
     np.testing.assert_allclose(answers[5].pose.Y, expected.Y, atol=1e-12)
     np.testing.assert_allclose(answers[5].pose.T, expected.T, atol=1e-12)
 
@@ -544,7 +543,7 @@ def test_the_motion_since_the_scan_before_is_known_except_after_a_break_or_on_a_
         assert answer.reference_ns == (3 * S if pairing == "consecutive" else 0)
         np.testing.assert_allclose(answer.motion.T, moved, atol=1e-12)
         steps = [GaussianPose(se3.inverse(SMALL_STEPS[0]) @ T, WIDE) for T in SMALL_STEPS[-2:]]
-        expected = inflation(bias_kept(moved)) * WIDE
+        expected = Bias().inflation(moved) * WIDE
         if pairing == "keyframe":
             expected = between(*steps, REFERENCE_SHARE).Y
         np.testing.assert_allclose(answer.motion.Y, expected, atol=1e-12)
