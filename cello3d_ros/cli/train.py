@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from cello3d_ros.learning.measures import Figures
 
 _FLAGS = ("shape", "features", "theta", "loss", "optimizer")
+_DATASETS = (
+    "folder; of those sampled from farther starts than another only the lost registrations count"
+)
 _COLUMNS = (  # heading, figure
     ("KL mean", "kl_mean"),
     ("median", "kl_median"),
@@ -26,7 +29,7 @@ _COLUMNS = (  # heading, figure
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
-    parser.add_argument("datasets", nargs="+", type=Path, metavar="DATASET", help="folder")
+    parser.add_argument("datasets", nargs="+", type=Path, metavar="DATASET", help=_DATASETS)
     parser.add_argument(
         "--out",
         required=True,

@@ -79,12 +79,18 @@ def load_examples(datasets: Sequence[Dataset], recordings: Iterable[str]) -> Exa
                 if key in records:
                     raise DatasetError(f"{dataset.path} repeats the pair {key} of another dataset")
                 records[key] = _slim(record := dataset.read(*key))
-                if record.accepted and not is_free(record.features).any():
-                    lost[key] = _lost(record, dataset.sampling)
+                lost[key] = _lost(record, dataset.sampling)
     found = _stacked([records[key] for key in sorted(records)], datasets[0])
-    return dataclasses.replace(
-        found, lost_xi=np.concatenate([np.zeros((0, 6)), *(lost[key] for key in sorted(lost))])
-    )
+    lost_xi = np.concatenate([np.zeros((0, 6)), *(lost[key] for key in sorted(lost))])
+    return dataclasses.replace(found, lost_xi=lost_xi)
+
+
+def lost_errors(dataset: Dataset, recordings: Iterable[str]) -> Array:
+    """Return the errors (M, 6) of the registrations that ended in another minimum."""
+    wanted = set(recordings)
+    keys = sorted(key for key in dataset.pair_keys() if key[0] in wanted)
+    found = [_lost(dataset.read(*key), dataset.sampling) for key in keys]
+    return np.concatenate([np.zeros((0, 6)), *found])
 
 
 def select_inputs(examples: Examples, kind: str) -> Examples:
@@ -225,7 +231,9 @@ def _check_alike(ours: Dataset, theirs: Dataset) -> None:
 
 
 def _lost(record: PairRecord, sampling: SamplingConfig) -> Array:
-    """Return the errors of the registrations that ended in another minimum.  (n, 6)."""
+    """Return the errors (n, 6) of an accepted, held pair that ended in another minimum."""
+    if not record.accepted or is_free(record.features).any():
+        return np.zeros((0, 6))
     far = far_from_truth(record.xi, sampling.cluster_scale_m, sampling.cluster_scale_rad)
     return record.xi[far]
 

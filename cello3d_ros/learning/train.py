@@ -9,12 +9,14 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from cello3d_ros.atomic import check_outputs, new_file
 from cello3d_ros.config import TrainingConfig
 from cello3d_ros.covariance.model import save_model
 from cello3d_ros.errors import DatasetError
-from cello3d_ros.learning.dataset import open_dataset
-from cello3d_ros.learning.examples import load_examples
+from cello3d_ros.learning.dataset import Dataset, open_dataset
+from cello3d_ros.learning.examples import load_examples, lost_errors
 from cello3d_ros.learning.identity import check_apart, recordings_of
 from cello3d_ros.learning.training import Progress, Training, fit
 
@@ -37,7 +39,9 @@ def train(
     """Learn a model from datasets and write it to ``out``, and beside it its learning curve.
 
     validation: recordings (names or patterns) or dataset folders that say when to stop, never
-    trained on; exclude: those that are not looked at.
+    trained on; exclude: those that are not looked at.  Datasets may differ in the variance of
+    their starts: the pairs of the nearest starts are the examples, and of the others only the
+    registrations count that ended in another minimum.
     Raises DatasetError for what cannot be trained on or kept apart, WriteError before training
     where ``out`` cannot be written.
     """
@@ -49,8 +53,11 @@ def train(
     split = split_recordings(known, _patterns(validation), _patterns(exclude))
     excluded = sorted(set(known) - set(split.training) - set(split.validation))
     check_apart(known, split.training, split.validation, excluded)
-    examples = load_examples(opened, split.training)
-    judging = load_examples(opened, split.validation) if split.validation else None
+    near, far = _by_starts(opened, {Path(f).resolve() for f in datasets})
+    examples = load_examples(near, split.training)
+    lost = [lost_errors(dataset, split.training) for dataset in far]
+    examples = dataclasses.replace(examples, lost_xi=np.concatenate([examples.lost_xi, *lost]))
+    judging = load_examples(near, split.validation) if split.validation else None
     training = fit(examples, config or TrainingConfig(), judging, progress)
     prints = {name: sorted(known[name]) for name in (*split.training, *split.validation)}
     provenance = {**training.model.provenance, "prints": prints}
@@ -83,6 +90,16 @@ def split_recordings(
     if not training:
         raise DatasetError("no recording is left to train on")
     return Split(training, validating)
+
+
+def _by_starts(
+    opened: Sequence[Dataset], training: set[Path]
+) -> tuple[list[Dataset], list[Dataset]]:
+    """Return the datasets of the nearest starts in training and for validation, and the others."""
+    to_train_on = [dataset for dataset in opened if dataset.path.resolve() in training]
+    least = min(dataset.sampling.variance for dataset in to_train_on)
+    far = [dataset for dataset in to_train_on if dataset.sampling.variance > least]
+    return [dataset for dataset in opened if dataset not in far], far
 
 
 def _matches(name: str, patterns: Sequence[str]) -> bool:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -317,6 +318,30 @@ def test_where_the_model_cannot_go_is_said_before_training(folder: Path, tmp_pat
 
 
 def test_datasets_that_do_not_mix_are_refused(folder: Path, tmp_path: Path) -> None:
-    other = fill(tmp_path / "other", ["stairs"], variance=0.2)
-    with pytest.raises(DatasetError, match=r"sampling.variance is 0.2, not 0.05"):
+    other = fill(tmp_path / "other", ["stairs"], max_offset_m=0.2)
+    with pytest.raises(DatasetError, match=r"sampling.max_offset_m is 0.2, not 1.0"):
         cello3d_train(folder, other, "--out", tmp_path / "model.npz")
+    far = fill(tmp_path / "far", ["stairs"], variance=0.2)
+    with pytest.raises(DatasetError, match=r"sampling.variance is 0.2, not 0.05"):
+        cello3d_train(folder, "--validation", far, "--out", tmp_path / "model.npz")
+
+
+def test_of_farther_starts_only_the_lost_registrations_count(folder: Path, tmp_path: Path) -> None:
+    """The examples are those of the near ones alone; how the lost scatter is of both."""
+    far = fill(tmp_path / "far", ["stairs", "hall_s0"], seed=1, variance=0.2)
+    dataset = open_dataset(far)
+    for key in dataset.pair_keys():
+        record = dataset.read(*key)
+        xi = record.xi.copy()
+        xi[:10, 0] += 5.0
+        dataset.write(replace(record, xi=xi, kept=np.arange(40) >= 10))
+    alone, both = tmp_path / "alone.npz", tmp_path / "both.npz"
+    cello3d_train(folder, "--out", alone)
+    cello3d_train(far, folder, "--out", both)
+    first, second = load_model(alone), load_model(both)
+    assert first.lost is None
+    assert second.lost is not None
+    np.testing.assert_allclose(second.lost.covariance[0, 0], 12.5, rtol=0.02)  # of any direction
+    np.testing.assert_array_equal(first.covariances, second.covariances)
+    np.testing.assert_array_equal(first.theta, second.theta)
+    assert second.provenance["recordings"] == first.provenance["recordings"]
