@@ -121,6 +121,8 @@ def _describe_model(path: Path, _: argparse.Namespace) -> dict[str, Any]:
         "prior_variance": model.sampling.variance,
         **_mean_sigmas(model),
         **_lost(model),
+        "bias_share": model.bias.share,
+        "bias_way_m": model.bias.way_m,
         "provenance": model.provenance,
         "pipeline": {name: config[name] for name in PIPELINE},
         "sampling": _settings(model.sampling),

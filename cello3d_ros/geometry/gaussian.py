@@ -19,6 +19,7 @@ _MARGIN = 1e-14  # smallest eigenvalue of a correlation matrix that rounding can
 _CONDITION = 1e-13  # least ratio of eigenvalues that still is positive definite when rounded
 _UNKNOWN = 1e12  # variance (m^2, rad^2) beyond which a chain does not grow
 REFERENCE_SHARE = 0.4  # of the variance of registrations, that those to one reference share
+_N_SUMMED = 50  # twists that a filter adds up, as of 5 s at 10 Hz
 _RAD_PER_M = 0.35  # a turn that tells two registrations apart as a metre of way does
 _ASYMMETRY = 1e-9  # largest difference of mirrored correlations that rounding can have made
 
@@ -48,12 +49,14 @@ class Bias(NamedTuple):
         return float(np.exp(-motion_m(T_step) / self.way_m))
 
     def inflation(self, T_step: ArrayLike) -> float:
-        """Return by how much the variance of a sum of steps exceeds that of independent ones.
+        """Return by how much the variance of the sum of 50 steps exceeds that of independent ones.
 
-        ``1 + 2 s phi / (1 - phi)``, of many steps like this one, which follow ``extended``.
+        ``1 + 2 s sum_k (1 - k / 50) phi^k``, k from 1 to 49, of steps like this one, which follow
+        ``extended``.
         """
-        phi = self.kept(T_step)
-        return 1.0 + 2.0 * self.share * phi / (1.0 - phi)
+        k = np.arange(1, _N_SUMMED)
+        left = (1.0 - k / _N_SUMMED) * self.kept(T_step) ** k
+        return 1.0 + 2.0 * self.share * float(left.sum())
 
 
 INDEPENDENT = Bias(share=0.0)

@@ -492,12 +492,14 @@ def test_a_chain_that_keeps_all_of_its_bias_stays_positive_definite() -> None:
         assert is_positive_definite(chain.Y)
 
 
-def test_the_sum_of_many_steps_varies_as_inflated_independent_ones() -> None:
-    Y, n, bias = 1e-8 * np.eye(6), 3000, Bias(0.3, 1.0)
-    step = se3.exp([0, 0, 0, 0, 0, 0.1])  # a turn, which does not carry rotation into translation
-    total = chained([GaussianPose(step, Y)] * n, bias).Y
-    np.testing.assert_allclose(total[5, 5] / n, bias.inflation(step) * 1e-8, rtol=0.01)
+def test_the_sum_of_50_steps_varies_as_inflated_independent_ones() -> None:
+    Y = 1e-8 * np.eye(6)
+    for way_m in (1.0, 64.0):
+        bias, step = Bias(0.3, way_m), se3.exp([0.1, 0, 0, 0, 0, 0])
+        total = chained([GaussianPose(step, Y)] * 50, bias).Y
+        np.testing.assert_allclose(total[3, 3] / 50, bias.inflation(step) * 1e-8, rtol=1e-6)
     assert INDEPENDENT.inflation(step) == 1.0
+    assert bias.inflation(np.eye(4)) == pytest.approx(1.0 + 0.3 * 49)  # all of it is kept
 
 
 def test_bias_is_kept_at_rest_and_lost_over_a_way_or_a_turn() -> None:
