@@ -1,8 +1,9 @@
 """Sample the simulated data of the shipped model: robots of all kinds in worlds of all kinds.
 
-    python benchmarks/training_set.py --out FOLDER [--part train|test] [--share 1.0] [--jobs 2]
+    python benchmarks/training_set.py --out FOLDER [--part train|test|far] [--share 1.0] [--jobs 2]
 
-The part "test" has seeds, worlds and robots of its own, and more places for each pair.  What is
+The part "test" has seeds, worlds and robots of its own, and more places for each pair.  The part
+"far" starts ICP as far off as the paper, for registrations that end in another minimum.  What is
 done stays in the folder, so that the same command goes on.  ``--list`` prints the recordings.
 """
 
@@ -24,14 +25,15 @@ from cello3d_ros.simulation.products import SCANNERS, calibrated
 from cello3d_ros.simulation.scanner import Scanner
 from cello3d_ros.simulation.simulation import Simulation
 
-FIRST_SEED = {"train": 1000, "test": 5000}
+FIRST_SEED = {"train": 1000, "test": 5000, "far": 9000}
 SAMPLING = {
     "train": SamplingConfig(n_samples=50, n_views=10, variance=0.0025, max_gap=2, n_rotations=1),
     "test": SamplingConfig(n_samples=60, n_views=15, variance=0.0025, max_gap=2, n_rotations=1),
+    "far": SamplingConfig(n_samples=60, n_views=10, max_gap=2, n_rotations=1),
 }
 N_SCANS = 3
-N_DRIVES = {"train": 24, "test": 6}  # of each world
-N_WALKS = {"train": 6, "test": 4}  # of each world of the paper's kinds
+N_DRIVES = {"train": 24, "test": 6, "far": 4}  # of each world
+N_WALKS = {"train": 6, "test": 4, "far": 2}  # of each world of the paper's kinds
 WALKED = ("rooms", "hall", "corridor", "stairs", "garden", "wood")
 OF_WALKS = ("spinning16", "spinning32", "spinning64", "wide")
 
