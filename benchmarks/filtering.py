@@ -127,10 +127,17 @@ def by_fuse(run: Heard, noise: Noise) -> tuple[Array, Array]:
         None if motion is None or noise is None else GaussianPose(motion.T, noise(motion))
         for motion in run.motions
     ]
-    found = list(chained(steps, answers))
+    found = list(chained(steps, answers, started(run)))
     truth = inverse(run.truth[0]) @ run.truth[1:]
     errors = log(inverse(truth) @ np.array([pose.T for pose in found]))
     return errors, np.array([pose.Y for pose in found])
+
+
+def started(run: Heard) -> set[int]:
+    """Return the numbers of the scans from which a motion is seen."""
+    ends = np.array([k for k, motion in enumerate(run.motions, 1) if motion is not None], int)
+    starts = run.times_s[ends] - np.array(run.spans_s)[ends - 1]
+    return set(np.abs(run.times_s[:, None] - starts).argmin(axis=0).tolist())
 
 
 def by_localization(Q: Array, run: Heard, noise: Noise) -> tuple[Array, Array]:

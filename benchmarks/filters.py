@@ -11,7 +11,7 @@ is a constraint between the robot's poses then, its covariance ``dt^2`` times th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -89,17 +89,21 @@ def localized(
 
 
 def chained(
-    steps: Iterable[GaussianPose], answers: Iterable[GaussianPose | None]
+    steps: Iterable[GaussianPose],
+    answers: Iterable[GaussianPose | None],
+    starts: Collection[int] = (),
 ) -> Iterator[GaussianPose]:
     """Yield the pose of a robot after each step: an error-state filter by the rules of fuse.
 
     steps: of the odometry, with right covariances.  answers: the pose at the end of the step seen
     from where the robot was at the answer before, or at the start; None where there is none.
-    The state is the pose and, as a clone, that at the answer before; ``T_true = T exp(xi)``.
+    starts: how many steps there were where a chain started anew without an answer: the next one is
+    seen from there.  The state is the pose and, as a clone, that from which the next answer is
+    seen; ``T_true = T exp(xi)``.
     """
     T = T_clone = np.eye(4)
     P = np.zeros((12, 12))
-    for step, answer in zip(steps, answers, strict=True):
+    for n, (step, answer) in enumerate(zip(steps, answers, strict=True), 1):
         T = T @ step.T
         F = np.eye(12)
         F[:6, :6] = adjoint(inverse(step.T))
@@ -111,5 +115,6 @@ def chained(
             K = P @ H.T @ np.linalg.inv(H @ P @ H.T + answer.Y)
             T = T @ exp((K @ log(inverse(between) @ answer.T))[:6])
             P = symmetrized(P - K @ H @ P)
+        if answer is not None or n in starts:
             T_clone, P = T, np.tile(P[:6, :6], (2, 2))
         yield GaussianPose(T, P[:6, :6].copy())

@@ -5,7 +5,7 @@ import pytest
 from filters import VELOCITIES, chained, corrected, grown, jacobian, localized, predicted
 
 from cello3d_ros.geometry.gaussian import GaussianPose, compound_right
-from cello3d_ros.geometry.se3 import exp, inverse, log
+from cello3d_ros.geometry.se3 import adjoint, exp, inverse, log
 
 Q_STEP = np.diag(np.repeat([0.02, 0.004], 3) ** 2)
 Y_ANSWER = np.diag([0.003, 0.02, 0.006, 0.001, 0.002, 0.004]) ** 2
@@ -60,6 +60,15 @@ def test_an_answer_over_two_steps_is_about_where_the_robot_was_at_the_one_before
     *_, found = chained(steps, [None, GaussianPose(both, 1e-12 * np.eye(6))])
     np.testing.assert_allclose(found.T, both, atol=1e-9)
     assert np.trace(found.Y) < 1e-10
+
+
+def test_an_answer_after_a_restart_is_about_where_the_chain_starts_anew() -> None:
+    steps = [GaussianPose(STEP, Q_STEP)] * 3
+    last = GaussianPose(STEP @ exp(np.full(6, 1e-3)), 1e-12 * np.eye(6))
+    *_, before, found = chained(steps, [None, None, last], starts={2})
+    np.testing.assert_allclose(found.T, before.T @ last.T, atol=1e-7)
+    moved = adjoint(inverse(last.T))
+    np.testing.assert_allclose(found.Y, moved @ before.Y @ moved.T, atol=1e-7)
 
 
 def test_errors_of_the_error_state_filter_are_as_it_says() -> None:
