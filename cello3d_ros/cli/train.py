@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cello3d_ros.config import TrainingConfig, load_config
+from cello3d_ros.errors import counted
 
 if TYPE_CHECKING:
     from cello3d_ros.learning.measures import Figures
@@ -62,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Train, write the model and print how good it is on recordings that it has not seen."""
-    from cello3d_ros.learning.train import curve_beside, train
+    from cello3d_ros.learning.train import FARTHER, curve_beside, train
 
     training = train(
         arguments.datasets,
@@ -77,6 +78,11 @@ def run(arguments: argparse.Namespace) -> None:
     n_pairs = training.model.provenance["recordings"]
     steps = f"Theta of step {training.best_iteration} of {training.n_iterations}"
     print(f"{arguments.out}: {sum(n_pairs.values())} pairs of {len(n_pairs)} recordings, {steps}")
+    for path, n_lost in training.model.provenance[FARTHER]:
+        print(
+            f"{path}: its starts are farther from the truth than those of another dataset: its "
+            f"pairs are no examples, its {counted(n_lost, 'lost registration')} count"
+        )
     print(f"{curve_beside(arguments.out)}: the loss over its steps")
     for name, figures in training.figures.items():
         print("\n".join(_table(name, figures)))

@@ -85,8 +85,12 @@ def load_examples(datasets: Sequence[Dataset], recordings: Iterable[str]) -> Exa
     return dataclasses.replace(found, lost_xi=lost_xi)
 
 
-def lost_errors(dataset: Dataset, recordings: Iterable[str]) -> Array:
-    """Return the errors (M, 6) of the registrations that ended in another minimum."""
+def lost_errors(dataset: Dataset, recordings: Iterable[str], like: Dataset) -> Array:
+    """Return the errors (M, 6) of the registrations that ended in another minimum.
+
+    Raises DatasetError where it differs from a dataset in other settings than that of its starts.
+    """
+    _check_alike(like, dataset, (*_FREE, "variance"))
     wanted = set(recordings)
     keys = sorted(key for key in dataset.pair_keys() if key[0] in wanted)
     found = [_lost(dataset.read(*key), dataset.sampling) for key in keys]
@@ -217,14 +221,14 @@ def check_settings(model: Model, examples: Examples) -> None:
         )
 
 
-def _check_alike(ours: Dataset, theirs: Dataset) -> None:
+def _check_alike(ours: Dataset, theirs: Dataset, free: tuple[str, ...] = _FREE) -> None:
     """Raise DatasetError naming the first setting in which two datasets differ."""
     found = differences(theirs.pipeline, ours.pipeline)
     a, b = dataclasses.asdict(theirs.sampling), dataclasses.asdict(ours.sampling)
     found += [
         f"sampling.{name} is {value}, not {b[name]}"
         for name, value in a.items()
-        if value != b[name] and name not in _FREE
+        if value != b[name] and name not in free
     ]
     if found:
         raise DatasetError(f"{theirs.path} does not go with {ours.path}: {found[0]}")

@@ -20,6 +20,8 @@ from cello3d_ros.learning.examples import load_examples, lost_errors
 from cello3d_ros.learning.identity import check_apart, recordings_of
 from cello3d_ros.learning.training import Progress, Training, fit
 
+FARTHER = "farther_starts"  # in the provenance: datasets of them, and their lost registrations
+
 
 class Split(NamedTuple):
     """Names of recordings by their use; what is excluded is in neither."""
@@ -53,14 +55,15 @@ def train(
     split = split_recordings(known, _patterns(validation), _patterns(exclude))
     excluded = sorted(set(known) - set(split.training) - set(split.validation))
     check_apart(known, split.training, split.validation, excluded)
-    near, far = _by_starts(opened, {Path(f).resolve() for f in datasets})
+    near, far = _by_starts(opened, {Path(f).resolve() for f in datasets}, split)
     examples = load_examples(near, split.training)
-    lost = [lost_errors(dataset, split.training) for dataset in far]
+    lost = [lost_errors(other, split.training, near[0]) for other in far]
     examples = dataclasses.replace(examples, lost_xi=np.concatenate([examples.lost_xi, *lost]))
     judging = load_examples(near, split.validation) if split.validation else None
     training = fit(examples, config or TrainingConfig(), judging, progress)
     prints = {name: sorted(known[name]) for name in (*split.training, *split.validation)}
-    provenance = {**training.model.provenance, "prints": prints}
+    counts = [[other.path.name, len(xi)] for other, xi in zip(far, lost, strict=True)]
+    provenance = {**training.model.provenance, "prints": prints, FARTHER: counts}
     model = dataclasses.replace(training.model, provenance=provenance)
     save_model(model, out)
     judged_by = "validation recordings" if judging else "training, regularised"
@@ -93,13 +96,27 @@ def split_recordings(
 
 
 def _by_starts(
-    opened: Sequence[Dataset], training: set[Path]
+    opened: Sequence[Dataset], training: set[Path], split: Split
 ) -> tuple[list[Dataset], list[Dataset]]:
-    """Return the datasets of the nearest starts in training and for validation, and the others."""
+    """Return the datasets of the nearest starts in training and for validation, and the others.
+
+    Raises DatasetError where the first leave nothing to train on or to validate by.
+    """
     to_train_on = [dataset for dataset in opened if dataset.path.resolve() in training]
     least = min(dataset.sampling.variance for dataset in to_train_on)
     far = [dataset for dataset in to_train_on if dataset.sampling.variance > least]
-    return [dataset for dataset in opened if dataset not in far], far
+    near = [dataset for dataset in opened if dataset not in far]
+    known = {name for dataset in near for name in dataset.recordings}
+    if known.isdisjoint(split.training):
+        raise DatasetError(f"no recording is left to train on whose starts have variance {least}")
+    if missing := sorted(set(split.validation) - known):
+        raise DatasetError(
+            f"{missing[0]} cannot validate: its starts are farther than in training"
+        )
+    keys = [key for dataset in far for key in dataset.pair_keys()]
+    if len(set(keys)) < len(keys):
+        raise DatasetError("two datasets of farther starts hold the same pair")
+    return near, far
 
 
 def _matches(name: str, patterns: Sequence[str]) -> bool:

@@ -324,9 +324,22 @@ def test_datasets_that_do_not_mix_are_refused(folder: Path, tmp_path: Path) -> N
     far = fill(tmp_path / "far", ["stairs"], variance=0.2)
     with pytest.raises(DatasetError, match=r"sampling.variance is 0.2, not 0.05"):
         cello3d_train(folder, "--validation", far, "--out", tmp_path / "model.npz")
+    unlike = fill(tmp_path / "unlike", ["stairs"], variance=0.2, max_offset_m=0.2)
+    with pytest.raises(DatasetError, match=r"sampling.max_offset_m is 0.2, not 1.0"):
+        cello3d_train(folder, unlike, "--out", tmp_path / "model.npz")
+    twice = fill(tmp_path / "twice", ["stairs"], variance=0.3)
+    with pytest.raises(DatasetError, match="hold the same pair"):
+        cello3d_train(folder, far, twice, "--out", tmp_path / "model.npz")
+    with pytest.raises(DatasetError, match="stairs cannot validate"):
+        cello3d_train(folder, far, "--validation", "stairs", "--out", tmp_path / "model.npz")
+    names = list(open_dataset(folder).recordings)
+    with pytest.raises(DatasetError, match="no recording is left to train on whose starts"):
+        cello3d_train(folder, far, "--exclude", *names, "--out", tmp_path / "model.npz")
 
 
-def test_of_farther_starts_only_the_lost_registrations_count(folder: Path, tmp_path: Path) -> None:
+def test_of_farther_starts_only_the_lost_registrations_count(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The examples are those of the near ones alone; how the lost scatter is of both."""
     far = fill(tmp_path / "far", ["stairs", "hall_s0"], seed=1, variance=0.2)
     dataset = open_dataset(far)
@@ -336,12 +349,16 @@ def test_of_farther_starts_only_the_lost_registrations_count(folder: Path, tmp_p
         xi[:10, 0] += 5.0
         dataset.write(replace(record, xi=xi, kept=np.arange(40) >= 10))
     alone, both = tmp_path / "alone.npz", tmp_path / "both.npz"
-    cello3d_train(folder, "--out", alone)
-    cello3d_train(far, folder, "--out", both)
+    cello3d_train(folder, "--exclude", "hall_s0", "--out", alone)
+    capsys.readouterr()
+    cello3d_train(far, folder, "--exclude", "hall_s0", "--out", both)
     first, second = load_model(alone), load_model(both)
+    assert "far: its starts are farther" in capsys.readouterr().out
     assert first.lost is None
     assert second.lost is not None
-    np.testing.assert_allclose(second.lost.covariance[0, 0], 12.5, rtol=0.02)  # of any direction
+    n = 50  # of stairs alone: five accepted pairs
+    assert second.provenance["farther_starts"] == [["far", n]]
+    np.testing.assert_allclose(second.lost.covariance[0, 0], 12.5 * n / (n - 1), rtol=0.02)
     np.testing.assert_array_equal(first.covariances, second.covariances)
     np.testing.assert_array_equal(first.theta, second.theta)
     assert second.provenance["recordings"] == first.provenance["recordings"]
