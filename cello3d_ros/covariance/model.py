@@ -38,7 +38,13 @@ from cello3d_ros.covariance.heading import FRAMES, blended, out_of_motion
 from cello3d_ros.covariance.lost import Lost
 from cello3d_ros.covariance.sums import pack, squared_distances, unpack, weighted_sum
 from cello3d_ros.errors import ConfigError, ModelError
-from cello3d_ros.geometry.gaussian import Bias, is_positive_definite, matrix_sqrt, symmetrized
+from cello3d_ros.geometry.gaussian import (
+    INDEPENDENT,
+    Bias,
+    is_positive_definite,
+    matrix_sqrt,
+    symmetrized,
+)
 from cello3d_ros.geometry.se3 import Array
 
 FORMAT = "cello3d-model"
@@ -273,7 +279,7 @@ def load_model(name: Path | str = "general") -> Model:
             mean_weight=header["mean_weight"],
             margin=header["margin"],
             lost=_lost_from(header.get("lost")),
-            bias=_bias_from(header.get("bias")),
+            bias=_bias_from(header.get("bias"), header["shape"]),
             pipeline=pipeline_of(config),
             sampling=config.sampling,
             provenance=header["provenance"],
@@ -340,10 +346,13 @@ def _lost_from(item: object) -> Lost | None:
     return Lost(**item)
 
 
-def _bias_from(item: object) -> Bias:
-    """Return what the header holds; models made before it was measured have the default."""
+def _bias_from(item: object, shape: object) -> Bias:
+    """Return what the header holds; models made before it was measured have the default.
+
+    Absolute covariances are compounded as independent ones, as in the paper.
+    """
     if item is None:
-        return Bias()
+        return INDEPENDENT if shape == "none" else Bias()
     if not isinstance(item, dict) or set(item) != set(Bias._fields):
         raise ModelError(f"item 'bias' is not a share and a way_m: {item!r}")
     return Bias(**item)
@@ -502,6 +511,8 @@ def _checked(lost: Lost) -> Lost:
 
 def _checked_bias(bias: Bias) -> Bias:
     """Return the bias as numbers, or raise ModelError."""
+    if not isinstance(bias, Bias):
+        raise ModelError(f"bias must be a Bias: {bias!r}")
     share, way_m = _number("bias.share", bias.share), _number("bias.way_m", bias.way_m)
     if not 0.0 <= share <= 1.0:
         raise ModelError(f"bias.share must be in [0, 1]: {share!r}")

@@ -85,14 +85,10 @@ def runs_of_models(
 ) -> list[Runs]:
     """Return the same runs judged by each of some models that have one pipeline.
 
-    Starts scatter as in the sampling of the first.  Steps of a model of absolute covariances are
-    compounded as independent ones, as in the paper; others with the bias of the model.
+    Starts scatter as in the sampling of the first.  Each compounds steps with its own bias.
     """
     runs = _runs(clouds, T_world_sensor, models, n_runs, seed, n_threads)
-    return [
-        _stacked(runs, k, T_world_sensor, INDEPENDENT if model.shape == "none" else model.bias)
-        for k, model in enumerate(models)
-    ]
+    return [_stacked(runs, k, T_world_sensor, model.bias) for k, model in enumerate(models)]
 
 
 def _runs(

@@ -43,8 +43,8 @@ class Bias(NamedTuple):
     def kept(self, T_step: ArrayLike) -> float:
         """Return phi, how much of the bias of one registration is left in the next.
 
-        ``exp(-(way + angle 1 m / 0.35 rad) / way_m)`` of the motion between the two: what is near
-        sees the same surfaces in the same way.  T_step: (4, 4).
+        ``exp(-(way + angle 1 m / 0.35 rad) / way_m)`` of the motion of the next: what is near sees
+        the same surfaces in the same way.  T_step: (4, 4).
         """
         return float(np.exp(-motion_m(T_step) / self.way_m))
 

@@ -20,7 +20,7 @@ from cello3d_ros.covariance.lost import Lost, spread_m
 from cello3d_ros.covariance.model import Model, project
 from cello3d_ros.covariance.sums import unpack
 from cello3d_ros.errors import ConfigError, DatasetError, FreeDirectionError
-from cello3d_ros.geometry.gaussian import sampled_covariance
+from cello3d_ros.geometry.gaussian import INDEPENDENT, Bias, sampled_covariance
 from cello3d_ros.geometry.se3 import Array
 from cello3d_ros.learning.bias import measured_bias
 from cello3d_ros.learning.dataset import package_versions
@@ -31,6 +31,7 @@ from cello3d_ros.learning.examples import (
     feature_scaler,
     flat_features,
     select_inputs,
+    to_absolute,
 )
 from cello3d_ros.learning.loss import (
     Problem,
@@ -148,7 +149,7 @@ def _model(
         mean_weight=config.mean_weight,
         margin=config.margin,
         lost=None if config.shape == "none" else known_lost(examples, config.frame),
-        bias=measured_bias(examples, config.shape),
+        bias=_bias(theta, problem, examples, config),
         pipeline=examples.pipeline,
         sampling=examples.sampling,
         provenance={
@@ -158,6 +159,14 @@ def _model(
             "versions": package_versions(),
         },
     )
+
+
+def _bias(theta: Array, problem: Problem, examples: Examples, config: TrainingConfig) -> Bias:
+    """Return what neighbouring registrations share; nothing in the paper's absolute form."""
+    if config.shape == "none":
+        return INDEPENDENT
+    F = config.margin * predicted(theta, problem)
+    return measured_bias(examples, to_absolute(F, examples, config.shape, config.frame))
 
 
 def _provenance(

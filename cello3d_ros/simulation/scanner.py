@@ -85,7 +85,7 @@ class Scanner:
             "range_noise_per_m": 0 <= self.range_noise_per_m <= 1,
             "range_offset_m": 0 <= self.range_offset_m <= 10,
             "elevation_error_deg": 0 <= self.elevation_error_deg <= 10,
-            "serial": self.serial >= 0,
+            "serial": isinstance(self.serial, int) and self.serial >= 0,
             "missing_share": 0 <= self.missing_share <= 1,
             "grazing_deg": 0 <= self.grazing_deg < 90,
             "reach_m": self.reach_m > 0,
@@ -222,11 +222,9 @@ def returns(
     if scanner.range_noise_per_m > 0.0:
         seen = np.where(np.isfinite(distance), distance, 0.0)
         noise = np.hypot(sigma_m, scanner.range_noise_per_m * seen) * unit
-    offset, elevation = _errors_of_beams(scanner)
-    if scanner.range_offset_m > 0.0:
-        noise = noise + offset
-    if scanner.elevation_error_deg > 0.0:
-        beams = _raised(beams, elevation)
+    if scanner.range_offset_m > 0.0 or scanner.elevation_error_deg > 0.0:
+        offset, elevation = _errors_of_beams(scanner)
+        noise, beams = noise + offset, _raised(beams, elevation)
     kept = (
         (distance + noise >= scanner.min_range_m)
         & (distance + noise <= scanner.max_range_m)

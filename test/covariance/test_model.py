@@ -39,7 +39,7 @@ from cello3d_ros.covariance.model import (
 )
 from cello3d_ros.errors import ModelError, WriteError
 from cello3d_ros.geometry import gaussian
-from cello3d_ros.geometry.gaussian import is_positive_definite
+from cello3d_ros.geometry.gaussian import INDEPENDENT, Bias, is_positive_definite
 from cello3d_ros.geometry.se3 import Array, adjoint, exp
 
 N, D, R = 40, 7, 3
@@ -372,6 +372,7 @@ def test_a_saved_model_comes_back_bit_by_bit(tmp_path: Path) -> None:
         ),
         sampling=SamplingConfig(variance=0.02, seed=7),
         lost=Lost(1 / 3, covariances(1, seed=9)[0]),
+        bias=Bias(1 / 3, 7.0),
         provenance={"recordings": ["a", "é"], "kl": {"mean": 1 / 3}, "tuple": (1, 2), "n": None},
     )
     save_model(model, tmp_path / "m.npz")
@@ -385,6 +386,7 @@ def test_a_saved_model_comes_back_bit_by_bit(tmp_path: Path) -> None:
     assert model.lost is not None
     assert back.lost is not None
     assert model.lost.limit_m == back.lost.limit_m
+    assert back.bias == Bias(1 / 3, 7.0)
     np.testing.assert_array_equal(model.lost.covariance, back.lost.covariance)
     d, S = descriptors(1, seed=21)[0], covariances(1, seed=22)[0]
     ours, theirs = predict(model, d, S), predict(back, d, S)
@@ -566,7 +568,19 @@ HEADERS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     ),
     "lost extent": (lambda h: h["lost"].update(covariance=[1.0]), "positive definite 6x6"),
     "lost item": (lambda h: h["lost"].pop("limit_m"), "not a limit_m and a covariance"),
+    "bias": (lambda h: h.update(bias=[0.1, 1.0]), "'bias' is not a share and a way_m"),
+    "bias item": (lambda h: h["bias"].pop("share"), "'bias' is not a share and a way_m"),
+    "bias share": (lambda h: h["bias"].update(share=1.5), "bias.share must be in [0, 1]"),
+    "bias way": (lambda h: h["bias"].update(way_m=0.0), "bias.way_m must be positive"),
+    "bias word": (lambda h: h["bias"].update(way_m="far"), "bias.way_m must be a number"),
 }
+
+
+def test_a_model_made_before_the_bias_was_measured_has_the_default(saved: Path) -> None:
+    change_header(saved, lambda h: h.pop("bias"))
+    assert load_model(saved).bias == INDEPENDENT  # its shape is none
+    change_header(saved, lambda h: h.update(shape="sandwich"))
+    assert load_model(saved).bias == Bias()
 
 
 def test_a_model_made_before_lost_registrations_were_known_knows_nothing(saved: Path) -> None:

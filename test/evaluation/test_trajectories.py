@@ -18,8 +18,9 @@ from cello3d_ros.evaluation.trajectories import (
     consistency,
     length_m,
     odometry_runs,
+    runs_of_models,
 )
-from cello3d_ros.geometry.gaussian import GaussianPose, is_positive_definite
+from cello3d_ros.geometry.gaussian import INDEPENDENT, Bias, GaussianPose, is_positive_definite
 from cello3d_ros.geometry.se3 import exp, inverse, log, transform
 
 
@@ -153,3 +154,21 @@ def test_runs_are_told_lost_by_the_model_that_knows(walk):
         assert found.told.tolist() == [is_told] * 2
         assert not found.lost.any()
         assert (np.linalg.eigvalsh(found.Y[0] - runs.Y[0])[-1] > 0.7) == is_told
+
+
+def test_each_model_compounds_with_its_own_bias(walk):
+    bias = Bias(0.6, 3.0)
+    models = [
+        dataclasses.replace(a_model(0.01, variance=1e-3), bias=b) for b in (INDEPENDENT, bias)
+    ]
+    alone = odometry_runs(*walk, models[1], 2, seed=3)
+    found = runs_of_models(*walk, models, 2, seed=3)
+    np.testing.assert_array_equal(found[1].Y, alone.Y)
+    for runs, b in zip(found, (INDEPENDENT, bias), strict=True):
+        steps = [path[0].T for path in runs.paths], [path[1].T for path in runs.paths]
+        for first, last, Y in zip(*steps, runs.Y, strict=True):
+            each = [
+                GaussianPose(T, models[0].covariances[0]) for T in (first, inverse(first) @ last)
+            ]
+            np.testing.assert_allclose(Y, compound_path(each, b)[-1].Y, rtol=1e-9, atol=1e-15)
+    assert np.trace(found[1].Y[0]) > 1.2 * np.trace(found[0].Y[0])

@@ -458,6 +458,19 @@ def test_both_scans_of_a_view_are_of_one_scanner_and_another_view_of_another():
     assert np.intersect1d(first[0], second[0]).size < 2
 
 
+def test_views_of_plain_ground_have_no_answer_as_nothing_holds_it_sideways():
+    scanner = dataclasses.replace(SCANNERS["spinning64"], range_noise_m=0.005)
+    down = np.repeat(np.sin(np.radians(-scanner.elevations())), scanner.shape[1])
+    far = np.divide(1.5, down, out=np.full(len(down), np.inf), where=down > 0.0)
+    echoes = Echoes(scanner, far, np.ones(len(far)))
+    points = measure(echoes, np.random.default_rng(0))
+    scan = Scan(stamp_ns=0, points=points, T_world_sensor=np.eye(4), look=lambda _: echoes)
+    sampling = dataclasses.replace(SAMPLING, n_samples=52, n_views=5, variance=1e-4)
+    pair = pair_of("a", 0, 1, *(prepare_scan(scan, "a", k, PIPELINE, sampling) for k in (0, 1)))
+    block = register_block(pair, PIPELINE, sampling, 0, 52)
+    assert (len(block.xi), block.n_failed) == (0, 52)
+
+
 def test_registrations_from_several_views_are_the_same_for_any_blocks_and_threads():
     sampling = dataclasses.replace(SAMPLING, n_samples=52, n_views=5)
     simulation = a_drive()

@@ -13,7 +13,7 @@ from cello3d_ros.covariance.closed_form import HELD
 from cello3d_ros.covariance.features import FEATURES
 from cello3d_ros.covariance.model import predict
 from cello3d_ros.errors import ConfigError, DatasetError
-from cello3d_ros.geometry.gaussian import is_positive_definite, kl, matrix_sqrt
+from cello3d_ros.geometry.gaussian import INDEPENDENT, is_positive_definite, kl, matrix_sqrt
 from cello3d_ros.geometry.se3 import Array, adjoint, exp
 from cello3d_ros.learning.dataset import Dataset, PairRecord, open_dataset
 from cello3d_ros.learning.examples import Examples, answers, feature_scaler, load_examples
@@ -651,3 +651,24 @@ def test_the_margin_is_in_the_figures_too() -> None:
     a, b = (t.figures["leave_recording_out"]["cello3d"] for t in (one, wide))
     assert b.dm2_over_6 == pytest.approx(a.dm2_over_6 / 2.0)
     assert wide.model.margin == 2.0
+
+
+def test_a_model_holds_the_bias_that_its_recordings_show_and_absolute_ones_none() -> None:
+    """All errors of a recording are one draw, in units of the sandwich."""
+    rng, n = np.random.default_rng(2), 60
+    examples = some(n)
+    b = rng.normal(size=(3, 6))
+    b *= np.sqrt(3.0) / np.linalg.norm(b, axis=1, keepdims=True)  # half of the six of a chi square
+    L = np.linalg.cholesky(examples.shapes["sandwich"])
+    xi = tuple(np.tile(L[k] @ b[k % 3], (50, 1)) for k in range(n))
+    examples = dataclasses.replace(
+        examples,
+        covariances=L @ np.swapaxes(L, 1, 2),
+        scans=np.array([[k // 3, k // 3 + 1] for k in range(n)]),
+        T_mean=np.tile(np.eye(4), (n, 1, 1)),
+        xi=xi,
+    )
+    config = TrainingConfig(features="descriptor", frame="sensor", theta="diagonal")
+    bias = fit(examples, config).model.bias
+    assert bias.share == pytest.approx(0.5, abs=0.01)
+    assert fit(examples, PAPER).model.bias == INDEPENDENT

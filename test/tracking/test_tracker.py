@@ -44,6 +44,8 @@ from cello3d_ros.tracking.warmup import room
 
 S = 10**9
 WIDE = np.diag([0.3, 0.2, 0.1, 0.05, 0.1, 0.2])
+BIAS = Bias(0.3, 7.0)
+MODEL = constant_model(WIDE, 704, bias=BIAS)
 
 
 @pytest.fixture
@@ -74,7 +76,7 @@ def tracker() -> Tracker:
     """A tracker that gives a reference up after two failures."""
     node = NodeConfig(pairing="consecutive", max_failures=2, max_pair_gap_s=5.0)
     config = Config(node=node)
-    return Tracker(constant_model(WIDE, 704), config, config.node)
+    return Tracker(MODEL, config, config.node)
 
 
 POINTS = room(np.random.default_rng(0), 500)
@@ -98,7 +100,7 @@ def test_chain_starts_at_the_odometry_and_compounds_what_neighbors_share(tracker
     for i in range(3, 7):
         answer = tracker.step(i * S, POINTS, Place(POSES[i]))
         T_step = se3.inverse(POSES[i - 1]) @ POSES[i]
-        chain = extended(chain, GaussianPose(T_step, WIDE), Bias())
+        chain = extended(chain, GaussianPose(T_step, WIDE), BIAS)
         np.testing.assert_allclose(answer.pose.T, chain.T, atol=1e-12)
         np.testing.assert_allclose(answer.pose.Y, chain.Y, atol=1e-12)
 
@@ -281,7 +283,7 @@ def test_reasons_are_the_narrowest_name() -> None:
 def tracker_with(**settings) -> Tracker:
     """A tracker that gives a reference up after three failures."""
     config = Config(node=NodeConfig(**{"pairing": "consecutive", **settings}))
-    return Tracker(constant_model(WIDE, 704), config, config.node)
+    return Tracker(MODEL, config, config.node)
 
 
 def shift(x: float) -> np.ndarray:
@@ -318,7 +320,7 @@ def test_covariance_accumulates_only_from_keyframe_to_keyframe(asked) -> None:
         np.testing.assert_allclose(answer.pose.Y, WIDE, atol=1e-12)
     expected = Chained.start(np.eye(4))
     for way_m in (1.2, 0.8):
-        expected = extended(expected, GaussianPose(shift(way_m), WIDE), Bias())
+        expected = extended(expected, GaussianPose(shift(way_m), WIDE), BIAS)
     np.testing.assert_allclose(answers[5].pose.Y, expected.Y, atol=1e-12)
     np.testing.assert_allclose(answers[5].pose.T, expected.T, atol=1e-12)
 
@@ -543,7 +545,7 @@ def test_the_motion_since_the_scan_before_is_known_except_after_a_break_or_on_a_
         assert answer.reference_ns == (3 * S if pairing == "consecutive" else 0)
         np.testing.assert_allclose(answer.motion.T, moved, atol=1e-12)
         steps = [GaussianPose(se3.inverse(SMALL_STEPS[0]) @ T, WIDE) for T in SMALL_STEPS[-2:]]
-        expected = Bias().inflation(moved) * WIDE
+        expected = BIAS.inflation(moved) * WIDE
         if pairing == "keyframe":
             expected = between(*steps, REFERENCE_SHARE).Y
         np.testing.assert_allclose(answer.motion.Y, expected, atol=1e-12)
