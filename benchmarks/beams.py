@@ -3,12 +3,12 @@
     python benchmarks/beams.py FOLDER [FOLDER ...] [--scan 2]
     python benchmarks/beams.py --simulated 0.01
 
-Each FOLDER is a recording.  Beams are told by their elevation.  Where the neighbourhood of a point
-is a plane that at least four beams meet, the distance along each beam from the plane is noted.  A
-beam's error is its mean over all planes to the left, and once more to the right; the covariance of
-the two, over the beams, is that of what is constant: ``offset``, its root.  The planes take a part
-of it with them: of simulated offsets of 10 mm it finds 5 to 11, 7 on average.  ``corr`` is the
-correlation of left and right, ``noise`` the deviation within one beam and plane.
+Each FOLDER is a recording. A beam is recognized by its elevation. Where the neighbourhood of a
+point is a plane that at least four beams meet, the distance along each beam from the plane is
+noted. A beam's error is its mean over all planes to the left, and once more to the right; the
+covariance of the two, over the beams, is that of what is constant: ``offset``, its root. The
+planes absorb a part of it: of simulated offsets of 10 mm it finds 3 to 8, 6 on average. ``corr``
+is the correlation of left and right, ``noise`` the deviation within one beam and plane.
 """
 
 from __future__ import annotations
@@ -37,21 +37,23 @@ def main() -> None:
     """Print a line for each recording."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", nargs="*", type=Path)
-    parser.add_argument("--scan", type=int, default=2, help="its number")
-    parser.add_argument("--simulated", type=float, metavar="M", help="in such worlds")
+    parser.add_argument("--scan", type=int, default=2, help="number of the scan, from 0")
+    parser.add_argument(
+        "--simulated", type=float, metavar="M", help="simulate offsets of M metres"
+    )
     arguments = parser.parse_args()
     for path in arguments.folders:
         scan = next(islice(open_recording(path), arguments.scan, None))
-        print(path.name, said(scan.points), flush=True)
+        print(path.name, summary(scan.points), flush=True)
     if arguments.simulated is not None:
         for world in ("parking", "hall", "street"):
             for name in ("vlp16", "hdl32e", "hdl64e", "os1_64"):
                 scanner = replace(SCANNERS[name], range_offset_m=arguments.simulated)
                 for scan in Simulation(world, 77, 1, scanner):
-                    print(world, name, said(scan.points), flush=True)
+                    print(world, name, summary(scan.points), flush=True)
 
 
-def said(points: Array) -> str:
+def summary(points: Array) -> str:
     """Return what is found of one scan (N, 3), in the frame of the sensor, as a line."""
     points = points[np.linalg.norm(points, axis=1) > 1.0]
     rows = distances(points, beams(points))

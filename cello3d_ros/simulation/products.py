@@ -131,7 +131,8 @@ SCANNERS = MappingProxyType(
 def calibrated(scanner: Scanner, rng: np.random.Generator) -> Scanner:
     """Return an individual of a scanner, with the errors that calibration leaves in its beams.
 
-    As large as the planes that real scanners see tell them to be (``docs/simulation.md``).
+    Their size is that of real scanners, measured on the planes of single scans
+    (``docs/simulation.md``).
     """
     factor = float(np.exp(rng.normal(0.0, _SPREAD)))
     return replace(
